@@ -28,8 +28,8 @@ from lagjax._engine.diffrax._equations import MotionEquations, equations_of
 from lagjax._engine.taylor import MachineCode
 from lagjax._equations._derivation import derivation_of
 from lagjax._interface._layout import Layout
-from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, compile_module, lanes
-from lagjax._native._lanes import emit, sincos_function
+from lagjax._native.code._ir import DOUBLE, INTEGER, POINTER, Code, compile_module, lanes
+from lagjax._native.series._lanes import emit, sincos_function
 from lagjax._tracing import lower
 
 TOLERANCE = 1e-9

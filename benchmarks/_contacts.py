@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import brentq
@@ -298,15 +299,20 @@ DISC = Scene(lambda q, v, t, p: 0.5 * v @ v, gaps=lambda q, t, p: 1 - (q @ q)[No
 def billiard(duration: float = 93.0) -> Row:
     """A particle in a circle."""
 
+    def flight(q, v):
+        b = q @ v / (v @ v)
+        return -b + jnp.sqrt(b * b - (q @ q - 1) / (v @ v))
+
+    def bounce(state):
+        q, v, left = state
+        t = flight(q, v)
+        q = q + v * t
+        return q, v - 2 * (q @ v) * q / (q @ q), left - t
+
     def exact(x):
-        q, v, left = x[:2], x[2:], duration
-        while True:
-            b = q @ v / (v @ v)
-            t = -b + jnp.sqrt(b * b - (q @ q - 1) / (v @ v))
-            if t > left:
-                return jnp.append(q + v * left, v)
-            q, left = q + v * t, left - t
-            v = v - 2 * (q @ v) * q / (q @ q)
+        start = x[:2], x[2:], jnp.asarray(duration)
+        q, v, left = jax.lax.while_loop(lambda state: flight(*state[:2]) <= state[2], bounce, start)
+        return jnp.append(q + v * left, v)
 
     return Row(
         f"circular billiard, {duration:g} long", DISC, [0.3, -0.2], [0.8, 0.6], [], duration, exact, (0, 1, 2, 3),

@@ -4,7 +4,7 @@
     python -m benchmarks.emitted --compare FOLDER    # at the one after: exit code 0 where no text differs
 
 A step that only says the compiler in other words must leave every line. The texts are those of LLVM's modules before
-any pass, as `_native._ir.compile_module` gets them, one file for each scene, form and module in the order of their
+any pass, as `_native.code._ir.compile_module` gets them, one file for each scene, form and module in the order of their
 making. They depend on the width of vectors: compare on one kind of machine.
 """
 
@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import lagjax
-from lagjax._native import _ir
+from lagjax._native.code import _ir
 
 TS = jnp.linspace(0.0, 1.0, 5)
 _SHOWN = 20  # lines of a difference that are printed

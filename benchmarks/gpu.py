@@ -7,8 +7,8 @@ in machine code on this machine's cores. Errors are those of the first members, 
 `first` is a new process's way to the first result: the series, PTX, the driver's assembly and the run itself. Parts
 begin in the order of `PARTS` while there is time left; what a part says is kept as it comes.
 
-`--forms` measures the choices of `lagjax._native._gpu` on a double pendulum: threads of a block, blocks, and how many
-coefficients are registers.
+`--forms` measures the choices of `lagjax._native.motions._gpu` on a double pendulum: threads of a block, blocks, and
+how many coefficients are registers.
 """
 
 import argparse

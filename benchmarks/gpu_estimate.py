@@ -13,9 +13,9 @@ threads are at work; on an H100
                   not hold, as if every access to that part missed them
 
 The longest of them is the estimate. Latencies, divergence and instruction caches come on top. Every scene is counted in
-the form that it would have there (`_native._gpu.form_for`) and with its series in local memory. The last rows are the
-batches of published comparisons, and a GPU for desktops, whose float64 is slow. The last column is measured: the same
-members in machine code on this machine's cores.
+the form that it would have there (`_native.motions._gpu.form_for`) and with its series in local memory. The last rows
+are the batches of published comparisons, and a GPU for desktops, whose float64 is slow. The last column is measured:
+the same members in machine code on this machine's cores.
 """
 
 import re

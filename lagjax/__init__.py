@@ -6,7 +6,8 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 
 **Motion**
 
-- `System`: L, constraints, forces, dissipation, contacts; `System.explain` tells what is in it
+- `System`: L, constraints, forces, dissipation, contacts; `System.explain` tells what is in it,
+  `System.equations` prints its `Equations`, `System.to_c` writes them in C
 - `simulate`, `simulate_batch`: one motion, or many at once, as a `Trajectory` of `State`s; with contacts its `Impacts`
   and `ContactChanges`
 - `samples`: an input that was measured, as a function of time
@@ -23,7 +24,8 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 
 **What a scene does**
 
-- `equilibrium`, `linearize`, `normal_modes`: at rest and near it: `Equilibrium`, `Linearization`, `Modes`
+- `equilibrium`, `steady_motion`, `linearize`, `normal_modes`: at rest or rolling on, and near it: `Equilibrium`,
+  `SteadyMotion`, `Linearization` (`ReducedLinearization`), `Modes`
 - `inverse_dynamics`: the forces that an acceleration takes
 - `conserved_quantities`, `noether_charge`, `cyclic_coordinates`: symmetries: `ConservedQuantities`, each `Conserved`
 - `same_motion`: whether two Lagrangians have one motion, as `SameMotion`
@@ -39,7 +41,7 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
   `Experiments`, a `Comparison`
 - `Record`, `Timings`, `Guess`, `Delayed`, `wrapped`: what was measured, and how
 - `Gaussian`, `StudentT`, `Quantised`, `Clipped`: the noise
-- `positive`, `between`, `angle`, `simplex`, `inertia`: what parameters may be
+- `positive`, `between`, `angle`, `simplex`, `inertia`: what parameters may be; `per_record`: one value a record
 
 **Many members, few numbers of each**
 
@@ -60,7 +62,7 @@ import importlib
 import importlib.util
 from typing import TYPE_CHECKING, Any
 
-from lagjax._interface import PLACES, VERSION
+from lagjax._interface import VERSION, Registered, register
 from lagjax._scene import System
 
 if TYPE_CHECKING:  # each is imported on first use: all of them take as long as JAX itself
@@ -77,6 +79,7 @@ if TYPE_CHECKING:  # each is imported on first use: all of them take as long as 
         normal_modes,
         routhian,
         same_motion,
+        steady_motion,
     )
     from lagjax._analysis.orbits import (
         action,
@@ -102,6 +105,7 @@ if TYPE_CHECKING:  # each is imported on first use: all of them take as long as 
         between,
         fit,
         inertia,
+        per_record,
         positive,
         simplex,
         wrapped,
@@ -121,16 +125,60 @@ __all__ = [
     "SimulationError", "Statistics", "Store", "StudentT", "Sweep", "System", "Timings", "Transition", "action", "angle",
     "between", "branch_off", "change_coordinates", "check", "conserved_quantities", "crossings", "cyclic_coordinates",
     "designs", "equilibrium", "family", "find_path", "fit", "hamiltonian", "inertia", "inverse_dynamics", "linearize",
-    "lyapunov_exponent", "lyapunov_spectrum", "noether_charge", "normal_modes", "periodic_orbit", "plot", "positive",
-    "results", "routhian", "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch", "sweep",
-    "work_precision", "wrapped",
+    "lyapunov_exponent", "lyapunov_spectrum", "noether_charge", "normal_modes", "per_record", "periodic_orbit", "plot",
+    "positive", "results", "routhian", "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch",
+    "steady_motion", "sweep", "work_precision", "wrapped",
 ]  # fmt: skip
 
 
 # What judges and shows a motion stands above it, and is imported when a method of `Trajectory` calls it.
-PLACES.update(dict.fromkeys(("dataset", "frame", "impact_frame", "change_frame"), "lagjax._show"))
-PLACES.update(dict.fromkeys(("make_animation", "summary", "trajectory_html"), "lagjax._show"))
-PLACES.update(describe_failure="lagjax._trust", examine="lagjax._trust.health", contact_forces="lagjax._run.contacts")
+def _load_show():
+    from lagjax import _show
+
+    return _show
+
+
+def _load_trust():
+    from lagjax import _trust
+
+    return _trust
+
+
+def _load_health():
+    from lagjax._trust import health
+
+    return health
+
+
+def _load_contacts():
+    from lagjax._run import contacts
+
+    return contacts
+
+
+def _load_run():
+    from lagjax import _run
+
+    return _run
+
+
+register(
+    Registered(
+        summary=lambda run: _load_show().summary(run),
+        trajectory_html=lambda run: _load_show().trajectory_html(run),
+        dataset=lambda run, units, time_unit: _load_show().dataset(run, units, time_unit),
+        frame=lambda run, units, time_unit: _load_show().frame(run, units, time_unit),
+        impact_frame=lambda impacts: _load_show().impact_frame(impacts),
+        change_frame=lambda changes: _load_show().change_frame(changes),
+        write_equations=lambda *scene: _load_show().write_equations(*scene),
+        write_c=lambda *scene: _load_show().write_c(*scene),
+        make_animation=lambda run, points, *look: _load_show().make_animation(run, points, *look),
+        examine=lambda run, reference: _load_health().examine(run, reference),
+        contact_forces=lambda run, name: _load_contacts().contact_forces(run, name),
+        find_states=lambda run, t: _load_run().find_states(run, t),
+        describe_failure=lambda run, layout, why: _load_trust().describe_failure(run, layout, why),
+    )
+)
 
 
 def __getattr__(name: str) -> Any:

@@ -28,7 +28,7 @@ import jax
 import llvmlite.binding
 import pytest
 
-from lagjax._native import _ir
+from lagjax._native.code import _ir
 
 jax.config.update("jax_enable_x64", True)
 

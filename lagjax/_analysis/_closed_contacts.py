@@ -13,9 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import nnls
 
-from lagjax._analysis._coordinates import restrict_signature
 from lagjax._analysis._scene_state import SceneState
-from lagjax._interface import Layout, accept, is_concrete
+from lagjax._interface import Layout, accept, is_concrete, restrict_signature
 from lagjax._primitives import nan_unless
 from lagjax._scene import ROLES, Flat, System, replace_functions, require_system
 

@@ -5,7 +5,6 @@ for every set of coordinates. Forces become (∂q/∂Q)ᵀ F, so that they do th
 """
 
 import functools
-import inspect
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,7 +13,7 @@ import jax.numpy as jnp
 
 from lagjax._analysis._scene_state import require_matrices
 from lagjax._analysis._solve import is_root, newton, shortest_preimage, shortest_solution
-from lagjax._interface import Function, Layout, accept, present
+from lagjax._interface import Function, Layout, accept, present, restrict_signature
 from lagjax._primitives import nan_unless
 from lagjax._scene import System, require_system
 
@@ -103,18 +102,6 @@ def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordin
         return _new_state(present(place), q, qdot, guess, t, params)
 
     return ChangedCoordinates(changed, old_state, to_new)
-
-
-def restrict_signature(function: Callable, extras: set[str], roles: int = 2) -> Callable:
-    """`function(*roles, t, params)` with a signature that shows only `extras`: without `t` it is autonomous."""
-
-    def restricted(*state, t=0.0, params=None, **more):
-        return function(*state, t, params, **more)
-
-    names = *("q", "qdot")[:roles], *(name for name in ("t", "params", "multipliers") if name in extras)
-    parameters = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in names]
-    restricted.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
-    return restricted
 
 
 def _new_state(place: Function, q: PyTree, qdot: PyTree, guess: PyTree, t, params: PyTree) -> tuple[PyTree, PyTree]:

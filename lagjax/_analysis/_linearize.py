@@ -1,20 +1,35 @@
 """`linearize`: the motions next to a motion."""
 
+import re
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax._analysis._closed_contacts import hold_closed, one_sided_reason
+from lagjax._analysis._eigen import tangent_basis
 from lagjax._analysis._equilibrium import least_multipliers
 from lagjax._analysis._scene_state import SceneState, require_matrices
 from lagjax._analysis._smoothness import is_smooth, require_smooth
-from lagjax._equations import diagonal_scale, factorize, saddle
-from lagjax._interface import compile_for_one_call, is_known, show_str
+from lagjax._equations import diagonal_scale, factorize, null_space, saddle
+from lagjax._interface import (
+    Function,
+    Layout,
+    accept,
+    compile_for_one_call,
+    is_concrete,
+    is_known,
+    require_finite,
+    require_number,
+    show_str,
+)
 from lagjax._primitives import accepts_singles, nan_unless
-from lagjax._scene import System
+from lagjax._run import simulate
+from lagjax._scene import Driven, System, asking_for_inputs, drive_scene, held_inputs, push_by_inputs, require_system
 
 PyTree = Any
 Vector = Float[Array, " n"]
@@ -22,62 +37,190 @@ Matrix = Float[Array, "n n"]
 _SHOWN = 8  # equations that are printed
 
 
+@jax.tree_util.register_static
+class LinearNames(tuple):
+    """The names of the coordinates (n,); `states` (2n,), `inputs` (m,) and `outputs` (p,) are those of the others."""
+
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+    def __new__(cls, coordinates: tuple[str, ...], inputs: tuple[str, ...], outputs: tuple[str, ...] | None = None):
+        names = super().__new__(cls, coordinates)
+        names.inputs, names.outputs = inputs, names.states if outputs is None else outputs
+        return names
+
+    def __getnewargs__(self) -> tuple:
+        return tuple(self), self.inputs, self.outputs
+
+    def __eq__(self, other: object) -> bool:
+        same = not isinstance(other, LinearNames) or self.__getnewargs__()[1:] == other.__getnewargs__()[1:]
+        return same and tuple(self) == other
+
+    __hash__ = tuple.__hash__  # pyright: ignore[reportAssignmentType]
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        return *(f"δ{name}" for name in self), *(f"δ{name}'" for name in self)
+
+
 class Linearization(NamedTuple):
     """The linear equations of small deviations from a state, in the order in which the leaves of q lie end to end.
 
-    - `A` (2n, 2n) and `B` (2n, n): d/dt (δq, δq̇) = A (δq, δq̇) + B u, where u (n,) are further generalised forces.
+    - `A` (2n, 2n) and `B` (2n, m): d/dt (δq, δq̇) = A (δq, δq̇) + B u. u (m,) are deviations of the inputs, or n
+      further generalised forces.
     - `mass_matrix` M, `damping` C, `gyroscopic` G, `stiffness` K, (n, n) each: M δq̈ + (C + G) δq̇ + K δq = u + Jᵀδλ, C
-      symmetric and G skew. M is symmetric; K is symmetric where all forces have a potential.
-    - `constraint_jacobian` J (m, n): constraints allow δq̇ with J δq̇ = 0; no rows without constraints.
-    - `names` (n,): those of the coordinates.
+      symmetric and G skew, u the generalised forces. M is symmetric; K is symmetric where all forces have a potential.
+    - `constraint_jacobian` J (r, n): constraints allow δq̇ with J δq̇ = 0; no rows without constraints.
+    - `names` (n,): those of the coordinates; `names.inputs`, `names.outputs` and `names.states` those of the others.
+    - `C` (p, 2n) and `D` (p, m): y = C (δq, δq̇) + D u, the deviations of the outputs; by default of the whole state.
+    - `sampled`: with a sample time, `Phi` (2n, 2n) and `Gamma` (2n, m): the deviation after it is Φ (δq, δq̇) + Γ u.
+    - `allowed` (s, 2n): constraints allow (δq, δq̇) with `allowed` (δq, δq̇) = 0.
     """
 
     A: Float[Array, "2n 2n"]
-    B: Float[Array, "2n n"]
+    B: Float[Array, "2n m"]
     mass_matrix: Matrix
     damping: Matrix
     gyroscopic: Matrix
     stiffness: Matrix
-    constraint_jacobian: Float[Array, "m n"]
-    names: tuple[str, ...]
+    constraint_jacobian: Float[Array, "r n"]
+    names: LinearNames
+    C: Float[Array, "p 2n"]
+    D: Float[Array, "p m"]
+    allowed: Float[Array, "s 2n"]
+    sampled: tuple[Array, Array] | None
 
     _repr_pretty_ = show_str
 
+    @property
+    def Phi(self) -> Float[Array, "2n 2n"]:
+        return self._sampled_pair[0]
+
+    @property
+    def Gamma(self) -> Float[Array, "2n m"]:
+        return self._sampled_pair[1]
+
+    @property
+    def _sampled_pair(self) -> tuple[Array, Array]:
+        if self.sampled is None:
+            raise AttributeError("Phi and Gamma are those of a sample time: call linearize(…, dt=…).")
+        return self.sampled
+
+    def reduced(self, motion: Any = None) -> "ReducedLinearization":
+        """The linear equations in the fewest numbers x (s,): those of deviations that constraints allow.
+
+        - `motion`: the `SteadyMotion` that this linearization is about. Deviations along cyclic coordinates are then
+          left out, and the others are seen from where it turns: A is constant along it, and its eigenvalues are the
+          exponents of its small motions. A zero is that of a steady motion next to it.
+
+        Constraints that depend on each other count once; inside `jit` all are taken as independent.
+        """
+        n, a, rows = len(self.names), self.A, self.allowed
+        if motion is not None:
+            layout = Layout.from_state(motion.q, motion.qdot)
+            a, rows = _remove_symmetries(a, rows, layout.flatten(motion.qdot), motion.turns)
+            cyclic = np.concatenate([np.ravel(x) for x in jax.tree.leaves(motion.cyclic)])
+            rows = rows[np.append(np.ones(len(self.allowed), bool), cyclic)]
+        rank = 2 * n - null_space(np.asarray(rows)).shape[1] if is_known(rows) else len(rows)
+        return ReducedLinearization._make(_reduce(rank, rows, a, self.B, self.C, self.D, self.sampled))
+
     def __str__(self) -> str:
         if not is_known(self.A) or np.ndim(self.A) != 2:
-            return f"Linearization: A {np.shape(self.A)}, B {np.shape(self.B)}"
-        n, more = len(self.names), len(self.names) - _SHOWN
-        of = [*(f"δ{name}" for name in self.names), *(f"δ{name}'" for name in self.names)]
-        of += [f"u{name.removeprefix('q')}" for name in self.names]
-        rows = np.hstack([self.A, self.B])[n : n + _SHOWN]
-        shown = [" ".join(f"{c:+.6g} {name}" for c, name in zip(row, of, strict=True) if c) or "0" for row in rows]
-        lines = [f"δ{name}'' = {line.removeprefix('+')}" for name, line in zip(self.names, shown, strict=False)]
-        return "\n".join([*lines, *([f"… ({more} more)"] if more > 0 else [])])
+            return f"Linearization: A {np.shape(self.A)}, B {np.shape(self.B)}, C {np.shape(self.C)}"
+        n, of = len(self.names), [*self.names.states, *self.names.inputs]
+        lines = _equations([f"δ{name}''" for name in self.names], np.hstack([self.A, self.B])[n:], of)
+        if self.names.outputs != self.names.states:
+            lines += _equations([f"δ{name}" for name in self.names.outputs], np.hstack([self.C, self.D]), of)
+        return "\n".join(lines)
 
 
-@accepts_singles(("q", "qdot"), ("params",))
-def linearize(system: System, q: PyTree, qdot: PyTree = None, params: PyTree = None) -> Linearization:
+class ReducedLinearization(NamedTuple):
+    """The linear equations of deviations (δq, δq̇) = `basis` x from a state, as LQR and Kalman filters take them.
+
+    - `A` (s, s), `B` (s, m), `C` (p, s), `D` (p, m): dx/dt = A x + B u, y = C x + D u.
+    - `basis` (2n, s), of orthonormal columns: x = basisᵀ (δq, δq̇) of a deviation that constraints allow.
+    - `Phi` (s, s) and `Gamma` (s, m) of a sample time; None without one.
+    """
+
+    A: Float[Array, "s s"]
+    B: Float[Array, "s m"]
+    C: Float[Array, "p s"]
+    D: Float[Array, "p m"]
+    basis: Float[Array, "2n s"]
+    Phi: Float[Array, "s s"] | None
+    Gamma: Float[Array, "s m"] | None
+
+
+@compile_for_one_call
+def _remove_symmetries(a: Array, rows: Array, qdot: Vector, turns: Array) -> tuple[Array, Array]:
+    """A in a frame that turns with a steady motion, and rows (k + n, 2n) whose last ones, one for each coordinate that
+    is cyclic, are zero for what is orthogonal to a deviation along it."""
+    spin = jnp.einsum("i,ijk", qdot, turns.astype(a.dtype))
+    moved = jnp.hstack([jnp.eye(len(qdot), dtype=a.dtype), turns.astype(a.dtype) @ qdot])
+    return a - jnp.kron(jnp.eye(2, dtype=a.dtype), spin), jnp.concatenate([rows, moved])
+
+
+@compile_for_one_call
+def _reduce(rank: int, rows: Array, a: Array, b: Array, c: Array, d: Array, sampled: tuple | None) -> tuple:
+    """The fields of a `ReducedLinearization` to what the `rows`, of this rank, send to zero."""
+    basis = tangent_basis(rows, rank)
+    inverse = factorize(basis.T @ basis).solve_columns(basis.T)  # orthonormal columns, but for derivatives
+    phi, gamma = (None, None) if sampled is None else (inverse @ sampled[0] @ basis, inverse @ sampled[1])
+    return inverse @ a @ basis, inverse @ b, c @ basis, d, basis, phi, gamma
+
+
+def _equations(left: list[str], rows: np.ndarray, of: list[str]) -> list[str]:
+    """Lines such as "δq'' = -1 δq +1 u", of each of the rows (k, l) of factors, and how many more there are."""
+    rows, more = np.asarray(rows)[:_SHOWN], len(left) - _SHOWN
+    shown = [" ".join(f"{c:+.6g} {name}" for c, name in zip(row, of, strict=True) if c) or "0" for row in rows]
+    lines = [f"{name} = {line.removeprefix('+')}" for name, line in zip(left, shown, strict=False)]
+    return [*lines, *([f"… ({more} more)"] if more > 0 else [])]
+
+
+@accepts_singles(("q", "qdot"), ("params", "inputs", "dt"))
+def linearize(
+    system: System,
+    q: PyTree,
+    qdot: PyTree = None,
+    params: PyTree = None,
+    *,
+    inputs: PyTree = None,
+    outputs: Callable | None = None,
+    dt: Any = None,
+) -> Linearization:
     r"""The equations of motion of `system`, linear in small deviations from the state (q, q̇), at rest by default.
 
         d/dt (δq, δq̇) = A (δq, δq̇) + B u,     A = ∂(q̇, q̈)/∂(q, q̇),   B = ∂(q̇, q̈)/∂u
+                    y = C (δq, δq̇) + D u,     (δq, δq̇) at t + dt = Φ (δq, δq̇) + Γ u
 
-    u are additional generalised forces. At an equilibrium A is constant and the solutions are exponentials
-    (`normal_modes`); along a motion these are the variational equations at that instant. With constraints, λ responds
-    to a deviation, and A and B keep a deviation on the constraints if it satisfies them. So it is with contacts that
-    are closed at the state and press: their gaps are the last rows of `constraint_jacobian`. The function works under
-    `jit`, `vmap` and `grad`.
+    At an equilibrium A is constant and the solutions are exponentials (`normal_modes`); along a motion these are the
+    variational equations at that instant. With constraints, λ responds to a deviation, and A and B keep a deviation on
+    the constraints if it satisfies them: `reduced()` has such deviations alone. So it is with contacts that are closed
+    at the state and press: their gaps are the last rows of `constraint_jacobian`. The function works under `jit`,
+    `vmap` (over the states of a trajectory, say) and `grad`.
 
-    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, for a scene that depends on the time, and
-    for a state at which the force jumps or has a kink, as dry friction at rest does: nothing is linear there. Inside
-    `jit` the derivatives of the force are NaN there instead.
+    - `inputs`: their value at the state, a number, an array or any pytree of them. Functions of the scene, L or the
+      forces, ask for `inputs` by name. u are the deviations from it. By default u are additional generalised forces.
+    - `outputs(q, qdot)`: what is measured, a number, an array or any pytree of them; it may ask for `t`, `params`,
+      `inputs`. By default y is the whole state, as in the package control.
+    - `dt`: the sample time, during which inputs are held. Φ and Γ are the derivatives of the motion from the state by
+      where it starts and by the inputs, to 1e-12 for each step of it; at an equilibrium they are those of
+      `scipy.signal.cont2discrete`.
 
-    Source: Landau & Lifshitz, *Mechanics*, §23; Meirovitch, *Methods of Analytical Dynamics*, §9.
+    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, for a scene that depends on the time, for
+    constraints that ask for inputs, and for a state at which the force jumps or has a kink, as dry friction at rest
+    does: nothing is linear there. Inside `jit` the derivatives of the force are NaN there instead. So are Φ and Γ of a
+    motion that cannot be followed over dt.
+
+    Source: Landau & Lifshitz, *Mechanics*, §23; Meirovitch, *Methods of Analytical Dynamics*, §9; Franklin, Powell &
+    Workman, *Digital Control of Dynamic Systems*, §4.3.
 
     ```python
     import jax.numpy as jnp, lagjax
 
-    pendulum = lagjax.System(lambda q, qdot: 0.5 * qdot**2 + 9.81 * jnp.cos(q))
-    print(lagjax.linearize(pendulum, 0.0).A)  # [[0, 1], [-9.81, 0]]
+    pendulum = lagjax.System(lambda q, qdot: 0.5 * qdot**2 + 9.81 * jnp.cos(q), forces=lambda q, qdot, inputs: inputs)
+    print(lagjax.linearize(pendulum, 0.0, inputs=0.0).A)  # [[0, 1], [-9.81, 0]]
+    print(lagjax.linearize(pendulum, 0.0, inputs=0.0, outputs=lambda q, qdot: jnp.sin(q), dt=0.01))
     ```
     """
     require_matrices(
@@ -86,16 +229,81 @@ def linearize(system: System, q: PyTree, qdot: PyTree = None, params: PyTree = N
         "The lowest modes are normal_modes(system, q, params, count=50); jax.jvp of system.acceleration gives the "
         "acceleration of one deviation.",
     )
+    system = require_system(system, contacts=True)
+    sensor = None if outputs is None else accept(outputs, "outputs", extras=("t", "params", "inputs"))
+    if inputs is not None:
+        inputs = _require_inputs(system, sensor, inputs)
+        system, params = drive_scene(system, held_inputs), Driven(params, inputs)
     if held := hold_closed(system, q, qdot, params, "A linearization"):
         system, q = held.system, held.require_loaded(q, qdot, params, one_sided_reason("A motion"))
     scene = SceneState.from_state(system, q, qdot, params)
     scene.require_autonomous("A linearization")
     require_smooth(scene, "A linearization")
-    return Linearization(*_linearize(*scene.arguments), names=scene.layout.names)
+    layout = scene.layout
+    of_inputs = None if inputs is None else Layout.from_numbers(inputs, "inputs", layout.dtype)
+    pushed = layout.names if of_inputs is None else of_inputs.names
+    shown = None if sensor is None else _output_names(sensor, scene, of_inputs is not None)
+    names = LinearNames(layout.names, tuple(f"u{re.sub('^(q|inputs)', '', name)}" for name in pushed), shown)
+    found, of_state = _linearize(of_inputs, sensor, *scene.arguments)
+    return Linearization._make((*found, names, *of_state, None if dt is None else _sample(scene, of_inputs, dt)))
+
+
+def _require_inputs(system: System, sensor: Function | None, inputs: PyTree) -> PyTree:
+    """The inputs, of floats. Raises where no function asks for them, or a constraint does."""
+    inputs = jax.tree.map(lambda x: 1.0 * x if _is_integer(x) else x, inputs)
+    Layout.from_numbers(inputs, "inputs", float)
+    require_finite(inputs, "inputs")
+    asking = asking_for_inputs(system)
+    if not asking and (sensor is None or "inputs" not in sensor.extras):
+        raise ValueError(
+            "inputs are given, and no function of the scene asks for `inputs`: let forces (or L) do, as "
+            "forces=lambda q, qdot, inputs: …; without inputs=… u are generalised forces."
+        )
+    if moved := [role for role in asking if role not in ("lagrangian", "forces", "dissipation")]:
+        raise ValueError(
+            f"{moved[0]} asks for `inputs`: an input that jumps would then make coordinates or velocities jump, which "
+            "no B says. Make what is prescribed a coordinate, with a force as the input that moves it."
+        )
+    return inputs
+
+
+def _is_integer(x: Any) -> bool:
+    return eqx.is_array_like(x) and jnp.issubdtype(jnp.result_type(x), jnp.integer)
+
+
+def _output_names(sensor: Function, scene: SceneState, driven: bool) -> tuple[str, ...]:
+    """The names of the outputs (p,). Raises `TypeError` where they are no real floats."""
+    shapes = jax.eval_shape(lambda q, v: _outputs(sensor, scene, driven, q, v, scene.params), scene.q, scene.qdot)
+    if not (names := Layout.from_numbers(shapes, "outputs", scene.layout.dtype).names):
+        raise TypeError("outputs must return at least one number.")
+    return tuple(f"y{name.removeprefix('outputs')}" for name in names)
+
+
+def _outputs(sensor: Function, scene: SceneState, driven: bool, q: Vector, qdot: Vector, params: PyTree) -> PyTree:
+    """The outputs in the user's structure, at parameters that are `Driven` where there are inputs."""
+    restore, extras = scene.layout.restore, {"inputs": params.inputs} if driven else {}
+    return sensor(restore(q), restore(qdot), t=0.0, params=params.params if driven else params, **extras)
+
+
+def _output_matrices(of_inputs: Layout | None, sensor: Function | None, scene: SceneState, u: Vector) -> list[Array]:
+    """C (p, 2n) and D (p, m), of the whole state without a sensor."""
+    if sensor is None:
+        return [jnp.eye(2 * scene.q.size, dtype=u.dtype), jnp.zeros((2 * scene.q.size, u.size), u.dtype)]
+
+    def measure(q, qdot, u):
+        shown = _outputs(sensor, scene, of_inputs is not None, q, qdot, _driven_params(of_inputs, scene, u))
+        return jnp.concatenate([jnp.ravel(x).astype(q.dtype) for x in jax.tree.leaves(shown)])
+
+    *of_state, d = jax.jacfwd(measure, argnums=(0, 1, 2))(scene.q, scene.qdot, u)
+    return [jnp.hstack(of_state), d]
+
+
+def _driven_params(of_inputs: Layout | None, scene: SceneState, u: Vector) -> PyTree:
+    return scene.params if of_inputs is None else scene.params._replace(inputs=of_inputs.restore(u))
 
 
 @compile_for_one_call
-def _linearize(*arguments) -> tuple:
+def _linearize(of_inputs: Layout | None, sensor: Function | None, *arguments) -> tuple:
     scene = SceneState.from_arguments(*arguments)
     n, state = scene.layout.size, (scene.q, scene.qdot, jnp.zeros((), scene.q.dtype), scene.numbers)
     zero, one = jnp.zeros((n, n), scene.q.dtype), jnp.eye(n, dtype=scene.q.dtype)
@@ -113,19 +321,58 @@ def _linearize(*arguments) -> tuple:
         def solve(b, c):
             return inverse.solve_columns(b)
 
-    def balance(q, qdot):
-        """F + Gᵀλ − M q̈ and γ − G q̈ at fixed q̈ and λ."""
-        jacobian, gamma = (of(q, qdot, *state[2:]) for of in (constraints.jacobian, constraints.gamma))
-        force = unbalanced(q, qdot, acceleration, *state[2:])
-        return jacobian.T @ multipliers - force, gamma - jacobian @ acceleration
+    def balance(q, qdot, u):
+        """F + Gᵀλ − M q̈ and γ − G q̈ at fixed q̈ and λ; the constraints and their rates."""
+        place = q, qdot, state[2], eqx.filter(_driven_params(of_inputs, scene, u), eqx.is_array_like)
+        jacobian, gamma = constraints.jacobian(*place), constraints.gamma(*place)
+        allowed = jnp.concatenate([constraints.f(q, *place[2:]), constraints.rates(*place)])
+        force = unbalanced(q, qdot, acceleration, *place[2:])
+        return jacobian.T @ multipliers - force, gamma - jacobian @ acceleration, allowed
 
-    smooth = is_smooth(scene)
-    of_balance, of_rows = jax.jacfwd(balance, argnums=(0, 1))(*state[:2])
-    by_q, by_qdot = (nan_unless(smooth, x) for x in of_balance)
-    response = solve(one, jnp.zeros((len(gamma), n), one.dtype))
+    smooth, of_state = is_smooth(scene), (0, 1) if of_inputs is None else (0, 1, 2)
+    u = jnp.zeros(n, one.dtype) if of_inputs is None else of_inputs.flatten(scene.params.inputs)
+    of_balance, of_rows, allowed = jax.jacfwd(balance, argnums=of_state)(*state[:2], u)
+    by_q, by_qdot, *by_u = (nan_unless(smooth, x) for x in of_balance)
+    pushes = solve(by_u[0], of_rows[2]) if by_u else solve(one, jnp.zeros((len(gamma), n), one.dtype))
     a = jnp.block([[zero, one], [solve(by_q, of_rows[0]), solve(by_qdot, of_rows[1])]])
-    b, rates = jnp.concatenate([zero, response]), -by_qdot
-    return a, b, mass, 0.5 * (rates + rates.T), 0.5 * (rates - rates.T), -by_q, jacobian
+    b, rates = jnp.concatenate([jnp.zeros_like(pushes), pushes]), -by_qdot
+    matrices = a, b, mass, 0.5 * (rates + rates.T), 0.5 * (rates - rates.T), -by_q, jacobian
+    return matrices, (*_output_matrices(of_inputs, sensor, scene, u), jnp.hstack(allowed[:2]))
+
+
+def _sample(scene: SceneState, of_inputs: Layout | None, dt) -> tuple[Array, Array]:
+    """Φ (2n, 2n) and Γ (2n, m). Raises `ValueError` where the motion cannot be followed over dt."""
+    require_number(dt, "dt")
+    if is_concrete(dt) and not 0 < dt < np.inf:
+        raise ValueError(f"dt is the sample time, a positive number; got {dt}.")
+    system, params = scene.system, scene.params
+    if of_inputs is None:  # u are generalised forces
+        none = scene.layout.restore(jnp.zeros_like(scene.q))
+        system, params, of_inputs = drive_scene(push_by_inputs(system), held_inputs), Driven(params, none), scene.layout
+    phi, gamma = _flow_derivatives(of_inputs, dt, system, scene.layout, scene.q, scene.qdot, params)
+    if all(map(is_concrete, (phi, gamma))) and not np.isfinite(phi).all():
+        raise ValueError(
+            f"The motion from this state cannot be followed over dt = {dt}, or has no derivative there: "
+            "lagjax.simulate(system, q, qdot, [0, dt], params) says why. Give a shorter dt, or another state."
+        )
+    return phi, gamma
+
+
+@eqx.filter_jit
+def _flow_derivatives(of_inputs: Layout, dt, system: System, layout: Layout, q, qdot, params: Driven):
+    """The derivatives of the state (2n,) after dt by that before it, and by inputs that are held."""
+
+    def follow(q, qdot, u):
+        driven = params._replace(inputs=of_inputs.restore(u))
+        ts = jnp.stack([jnp.zeros((), q.dtype), jnp.asarray(dt, q.dtype)])
+        run = simulate(system, layout.restore(q), layout.restore(qdot), ts, driven, rtol=_RTOL, throw=False)
+        return jnp.concatenate([layout.flatten(run.end.q), layout.flatten(run.end.qdot)])
+
+    *of_state, of_u = jax.jacfwd(follow, argnums=(0, 1, 2))(q, qdot, of_inputs.flatten(params.inputs))
+    return jnp.hstack(of_state), of_u
+
+
+_RTOL = 1e-12  # of a step: what the order of Taylor series makes cheap, and rounding leaves room for
 
 
 def steady_matrices(scene: SceneState, q: Vector) -> tuple[Matrix, Matrix, Matrix, Array, Vector]:

@@ -15,10 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from lagjax._analysis._coordinates import restrict_signature
 from lagjax._analysis._scene_state import SceneState
 from lagjax._equations import factorize
-from lagjax._interface import Layout, present
+from lagjax._interface import Layout, present, restrict_signature
 from lagjax._run import simulate
 from lagjax._scene import System
 

@@ -105,9 +105,9 @@ class Constraints(eqx.Module):
 # it, of up to `_native.START`. It would also take care of more, but by moving the start elsewhere.
 TOLERANCE = {np.dtype("float64"): 1e-6, np.dtype("float32"): 5e-6}
 
-# A constraint holds as well where its value is no more than so many roundings of its own terms, whatever the size of q:
-# coordinates that are deviations from a drawn pose begin at zero, beside links of a metre. They are those that float32
-# is given above. Doubled, a link of a kilometre may be off by 18 nm, where it now may by 9.
+# A constraint also holds if its value is at most `ROUNDINGS` roundings of its own terms, whatever the size of q:
+# coordinates that are deviations from a drawn pose begin at zero, with links of a metre. The bound for float32 above is
+# as many. Doubled, a link of a kilometre may be wrong by 18 nm instead of 9.
 ROUNDINGS = 40
 
 

@@ -223,7 +223,7 @@ class Derivation:
 
     def term_sizes(self, q, qdot, t, numbers: PyTree, names: tuple[str, ...] = ("residual", "rates")):
         """The sizes of the terms of quantities at a state of numbers or tracers, (outputs,); 0 without programs."""
-        # The rounding of a quantity is so many times `eps`: its running error, with inputs that are rounded, too. It is
+        # The rounding of a quantity, in units of `eps`: its running error, with that of rounded inputs included. It is
         # 0.6 for 0.1 + q0 + 0.2 - q1 - 0.3 at q = 0, where the value, 0 or 6e-17, says nothing.
         state = [q, qdot, t, *jax.tree.leaves(numbers)]
         try:

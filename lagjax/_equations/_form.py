@@ -2,8 +2,8 @@
 
     form                  by whom                                decided by
     scalar, line          machine code, operation by operation   `derived_form`
-    scalar, table         machine code, from tables              `LARGEST_LINE` (`_native/_constants`)
-    scalar, registers     a thread of a GPU                      `_native/_gpu`
+    scalar, table         machine code, from tables              `LARGEST_LINE` (`_native/code/_constants`)
+    scalar, registers     a thread of a GPU                      `_native/motions/_gpu`
     scalar                XLA, a program                         `form_in_xla`
     arrays                XLA: M and G as matrices               `form_in_xla`
     sparse                XLA: products, solved by patterns      `derived_form`
@@ -39,9 +39,9 @@ BYTES_OF_ENTRY = 20
 
 # ---- sparse arrays ---------------------------------------------------------------------------------------------------
 
-# Coordinates from which arrays look for patterns, and the scalar operations of L from which a scene of so many runs on
-# arrays: a ring of 1000 (11 000 operations) takes 3.5 s to a first result by machine code, 2 s by arrays, whose time
-# hardly grows; a batch of 256 rings of 300 is 30 times faster in machine code. With constraints it is coordinates that
+# Coordinates from which patterns of zeros are looked for, and the number of scalar operations of L from which such a
+# scene runs on arrays: a ring of 1000 (11 000 operations) takes 3.5 s to a first result by machine code, 2 s by arrays,
+# whose time hardly grows; a batch of 256 rings of 300 is 30 times faster in machine code. With constraints coordinates
 # count: 100 rods (200) take machine code 4 s and 500 more than 240, arrays 8 s either way.
 LEAST_COORDINATES = 100
 LEAST_OPERATIONS, LEAST_LINKED = 6000, 300

@@ -25,10 +25,10 @@ from jaxtyping import Float
 
 Numbers = Float[np.ndarray, " n"]
 
-# Where along the line the forces are looked at, in parts of l: steps by two, which is how well a reach is known. Where
-# l is not known these are all sizes a double can have, but for those whose squares it has not.
+# Points of the line at which forces are evaluated, as fractions of l: powers of two, so a reach is known to a factor of
+# two. If l is unknown, these are all sizes of a double whose squares are finite and not zero.
 _STEPS, _ALL_STEPS = 2.0 ** np.arange(-10.0, 41.0), 2.0 ** np.arange(-400.0, 401.0, 2.0)
-# F is not linear where it is off by this part of its change; a change that rounding may have made does not count.
+# F is not linear if it deviates by this fraction of its change; a change below `_SEEN` may be rounding, and is ignored.
 _BENT, _SEEN = 0.25, 1e-6
 
 

@@ -12,6 +12,8 @@ Three rooms, each of which imports only from those before it:
     result/    Fit: intervals, what is not seen, verdict, profile, draws, predictions, report
 """
 
+import contextlib
+import functools
 import itertools
 import sys
 import time
@@ -24,7 +26,7 @@ import numpy as np
 
 from lagjax._fit.model._assembly import GivenSystem, assemble_residuals, read_systems
 from lagjax._fit.model._noise import AbstractNoise, Clipped, Gaussian, Quantised, StudentT
-from lagjax._fit.model._parameters import Parameters
+from lagjax._fit.model._parameters import Parameters, per_record
 from lagjax._fit.model._records import Guess, Record, require_untraced
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals
 from lagjax._fit.model._sensors import Delayed, wrapped
@@ -87,7 +89,9 @@ def fit(
       for those that show angles less whole turns.
     - `free`: True or False for every parameter, or for whole branches of `params0`, or a Boolean array for the numbers
       of an array; by default all floats are free. With False starts and noise alone are fitted: how good are published
-      parameters on these records?
+      parameters on these records? `lagjax.per_record` for a number, or a whole array, that every record has of its own:
+      an offset, a gain, a delay, or what a start is computed from. Functions of the scene and `observe` see the number
+      of the record that they are called for; `Fit.params` has them all, with the records as first axis.
     - `transforms`: `lagjax.positive`, `lagjax.between(a, b)`, `lagjax.angle` or None for every parameter or branch;
       an array of these for the numbers of an array, `np.array([lagjax.positive, None])`; `lagjax.simplex` and
       `lagjax.inertia` for a whole array. A parameter that is known to be positive should say so:
@@ -143,11 +147,12 @@ def fit(
     if not isinstance(noise, AbstractNoise):
         raise TypeError(f"noise must be lagjax.Gaussian(), StudentT(), Quantised(…) or Clipped(…); got {noise!r}.")
     given = read_systems(system, records, params0, observe, hold)
-    parameters = Parameters.from_pytree(params0, free, transforms)
-    search = _FitSearch(params0, parameters, noise, int(starts), method, int(seed), progress)
-    if len(parameters) > _MANY_UNKNOWNS and method != "gradient":
+    build = functools.partial(Parameters.from_pytree, params0, free, transforms)
+    search = _FitSearch(params0, build, noise, int(starts), method, int(seed), progress)
+    followed = build(sum(len(one.records) for one in given)).unknowns.columns.shape[1]
+    if followed > _MANY_UNKNOWNS and method != "gradient":
         warnings.warn(
-            f"{len(parameters)} numbers are free, and with method={method!r} every trial follows that many derivatives "
+            f"{followed} numbers are free, and with method={method!r} every trial follows that many derivatives "
             "of every motion, which may take minutes each. method='gradient' takes all of them at once, in reverse: it "
             "is for networks and other functions of many numbers.",
             stacklevel=2,
@@ -170,7 +175,7 @@ class _FitSearch(NamedTuple):
     """The settings of a fit, for these records and for others without a mistake."""
 
     params0: PyTree
-    parameters: Parameters
+    build: Callable[[int], Parameters]
     law: AbstractNoise
     starts: int
     method: str
@@ -183,13 +188,15 @@ class _FitSearch(NamedTuple):
         Motion that sticks, or strikes, has many minima: with `looks_further` more starts are tried where one leaves
         motion.
         """
-        residuals = assemble_residuals(given, self.parameters, self.law)
+        parameters = self.build(sum(len(one.records) for one in given))
+        residuals = assemble_residuals(given, parameters, self.law)
         self._require_one_beginning(residuals)
         readers = read_records(residuals)
+        u = parameters.inverse(parameters.first)
+        point, waterfall = Point(u, first_starts(residuals, readers, self.params0)), None
+        residuals, point = _keep_unused(residuals, point)
         if self.progress:
             residuals.watch = _print_trials(residuals.size)
-        u = self.parameters.inverse(self.parameters.first)
-        point, waterfall = Point(u, first_starts(residuals, readers, self.params0)), None
         search = Search(residuals, self.law, self.method, readers)
         if self.method == "gradient":
             descent = search.descend_gradient(point)
@@ -198,7 +205,7 @@ class _FitSearch(NamedTuple):
             may = (
                 looks_further
                 and self.starts == 1
-                and len(self.parameters)
+                and len(residuals.parameters)
                 and not any(p.clocks for p in residuals.parts)
             )
             for starts in _MORE_STARTS if may and any(jumps(part.scene) for part in residuals.parts) else ():
@@ -211,7 +218,7 @@ class _FitSearch(NamedTuple):
         return Fit.from_descent(descent, self.law, waterfall)
 
     def _require_one_beginning(self, residuals: Residuals) -> None:
-        if not len(self.parameters) and (self.method == "gradient" or self.starts > 1):
+        if not len(residuals.parameters) and (self.method == "gradient" or self.starts > 1):
             raise ValueError(
                 "No parameter is free, so there is one place to begin: leave `starts` at 1, and `method` at 'auto', "
                 "which fits the starts of records."
@@ -231,8 +238,9 @@ class _FitSearch(NamedTuple):
         """The first mistake in records that explains a poor fit, as a sentence; `spent` is the fit's processor time."""
         if len(given) > 1 or self.method == "gradient":
             return []
-        once, residuals = self._replace(starts=1, progress=False), assemble_residuals(given, self.parameters, self.law)
-        [part], [system] = residuals.parts, given
+        [system], once = given, self._replace(starts=1, progress=False)
+        residuals = assemble_residuals(given, self.build(len(system.records)), self.law)
+        [part] = residuals.parts
         if not part.signals.names:
             return []
 
@@ -243,11 +251,30 @@ class _FitSearch(NamedTuple):
                 return None
             return None if left.motion else left.share
 
-        reading = [reader for reader in read_records(residuals) if reader is not None]
-        scales = time_scales(reading, part.motions, self.parameters.first) if reading else TimeScales(1.0, 1.0)
+        reading = {k: reader for k, reader in enumerate(read_records(residuals)) if reader is not None}
+        numbers = residuals.parameters.first[residuals.parameters.places[list(reading)]]
+        scales = TimeScales(1.0, 1.0)
+        if reading:
+            scales = time_scales(list(reading.values()), part.motions, numbers)
         slower = scales.data / scales.scene if np.isfinite(scales.data) else 1.0
         possible = possible_mistakes(system.records, part.signals.names, left.worst, slower)
         return find_mistake(share, possible, left.share, max(spent, SECONDS) if left.motion else spent)
+
+
+def _keep_unused(residuals: Residuals, point: Point) -> tuple[Residuals, Point]:
+    """The residuals and the point where numbers of records on which the signals of their system do not depend at all,
+    but those of others do, stay as they are: the offset of a sensor that one of two machines has."""
+    states, unknowns, kept = residuals.states, residuals.unknowns, np.zeros(len(residuals.parameters), bool)
+    if unknowns.own and len(residuals.parts) > 1:
+        with contextlib.suppress(LostMotion):
+            own = (x[..., states : states + unknowns.own].any(axis=(0, 1, 2)) for x in residuals.evaluate(point).slopes)
+            uses = np.array([np.any([next(own) for _ in part.batches], axis=0) for part in residuals.parts])
+            for part, used in zip(residuals.parts, uses, strict=True):
+                kept[unknowns.columns[part.frame.rows, : unknowns.own][:, ~used & uses.any(axis=0)]] = True
+    if not kept.any():
+        return residuals, point
+    parameters = residuals.parameters.fix(point.u, kept)
+    return residuals.with_parameters(parameters), point._replace(u=point.u[~kept])
 
 
 def _print_trials(size: np.ndarray) -> Callable[[Any], None]:

@@ -7,8 +7,23 @@ what to try, and the exception; `_platform` the kind of device that JAX computes
 `_registered` is how a room calls a function of a room above, `_version` the version of the package.
 """
 
-from lagjax._interface._arguments import Function, ValueNotKnown, accept, find_params_expression, present
-from lagjax._interface._layout import Layout, describe_numbers, dtype_of, flatten_numbers, halves, labelled_leaves
+from lagjax._interface._arguments import (
+    Function,
+    ValueNotKnown,
+    accept,
+    find_params_expression,
+    present,
+    restrict_signature,
+)
+from lagjax._interface._layout import (
+    Layout,
+    describe_numbers,
+    dtype_of,
+    flatten_numbers,
+    halves,
+    labelled_leaves,
+    number_names,
+)
 from lagjax._interface._platform import (
     compile_for_one_call,
     compiled_once,
@@ -17,7 +32,7 @@ from lagjax._interface._platform import (
     is_known,
     numbers_at,
 )
-from lagjax._interface._registered import PLACES, import_registered
+from lagjax._interface._registered import Registered, register, registered
 from lagjax._interface._results import (
     ENDED_WELL,
     EVENT_OCCURRED,

@@ -55,8 +55,9 @@ class Function(eqx.Module):
         function = eqx.combine(self.arrays, self.code.function)
         if "inputs" in self.extras and "inputs" not in extras:
             raise TypeError(
-                f"{self.name} asks for `inputs`, which only the records of lagjax.fit have. To follow a motion with "
-                "sampled inputs, let it ask for `t` instead, and call lagjax.samples(knots, values)(t)."
+                f"{self.name} asks for `inputs`, which only the records of lagjax.fit have, and lagjax.linearize(…, "
+                "inputs=…). To follow a motion with sampled inputs, let it ask for `t` instead, and call "
+                "lagjax.samples(knots, values)(t)."
             )
         try:
             with self.code.traced():
@@ -180,6 +181,18 @@ def accept(
         )
     arrays, code = eqx.partition(function, eqx.is_array)
     return Function(arrays, Edition.from_function(code), tuple(p.name for p in given))
+
+
+def restrict_signature(function: Callable, extras: set[str], roles: int = 2) -> Callable:
+    """`function(*roles, t, params)` with a signature that shows only `extras`: without `t` it is autonomous."""
+
+    def restricted(*state, t=0.0, params=None, **more):
+        return function(*state, t, params, **more)
+
+    names = *("q", "qdot")[:roles], *(name for name in ("t", "params", "inputs", "multipliers") if name in extras)
+    parameters = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in names]
+    restricted.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
+    return restricted
 
 
 def _resembles_extra(name: str, extras: tuple[str, ...]) -> bool:

@@ -1,13 +1,37 @@
-"""Functions of rooms above that rooms below call: a trajectory shows itself, a failure is explained.
+"""Functions of rooms above that a trajectory or a scene calls: it shows itself, its failure is explained.
 
-No room imports from above. `lagjax/__init__` says here where these functions are, and a call imports them.
+No room imports from above. `lagjax/__init__` stands above all of them and registers these functions; each imports its
+room when it is called.
 """
 
-import importlib
-from typing import Any
-
-PLACES: dict[str, str] = {}  # module of each function by its name
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 
-def import_registered(name: str) -> Any:
-    return getattr(importlib.import_module(PLACES[name]), name)
+class Registered(NamedTuple):
+    """The functions, of a scene, a trajectory or a table in it; `units` and `time_unit` are those of `to_xarray`."""
+
+    summary: Callable[[Any], str]
+    trajectory_html: Callable[[Any], str | None]
+    dataset: Callable[[Any, Any, str | None], Any]
+    frame: Callable[[Any, Any, str | None], Any]
+    impact_frame: Callable[[Any], Any]
+    change_frame: Callable[[Any], Any]
+    write_equations: Callable[..., Any]
+    write_c: Callable[..., str]
+    make_animation: Callable[[Any, Callable, Any, float, float], Any]
+    examine: Callable[[Any, Any], Any]
+    contact_forces: Callable[[Any, str], Any]
+    find_states: Callable[[Any, Any], Any]
+    describe_failure: Callable[[Any, Any, str | None], str]
+
+
+_registered: list[Registered] = []
+
+
+def register(functions: Registered) -> None:
+    _registered[:] = [functions]
+
+
+def registered() -> Registered:
+    return _registered[0]

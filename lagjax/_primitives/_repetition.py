@@ -29,8 +29,8 @@ from lagjax._primitives._on_host import HostFunction, call_host
 class Repetition:
     """`step(x, carry, still, row)` → (carry, of the round, parts of sums), lists of arrays; it is known by identity.
 
-    There are so many arrays x (`inputs`), `carried`, `rows`, and `fixed` of those that are still. `of_round` and `sums`
-    are shapes of doubles: what is written down of each round, and what is summed over all.
+    `inputs`, `carried`, `rows` and `fixed` count the arrays x, of the carry, of rows and of those that stay. `of_round`
+    and `sums` are shapes of doubles: what is recorded in each round, and what is summed over all.
     """
 
     def __init__(self, step: Callable, inputs: int, carried: int, of_round: tuple, sums: tuple, rows=1, fixed=0):
@@ -149,7 +149,7 @@ def _halves(arrays) -> list[list]:
 
 
 def _split(arrays, *sizes: int) -> list[list]:
-    """The first ones, so many, and so on, and those that are left."""
+    """Lists of the first arrays, of these `sizes`, and the rest."""
     ends = [0, *itertools.accumulate(sizes), len(arrays)]
     return [list(arrays[a:b]) for a, b in itertools.pairwise(ends)]
 

@@ -298,10 +298,10 @@ def distances(found: Borders) -> StraightLine:
 
 
 def with_outputs(program: Recurrent, more: StraightLine, moving: int | None = None) -> Pieced:
-    """A program with the outputs of another line of the same inputs behind its own; what both compute is shared.
+    """A program with the outputs of a second line of the same inputs after its own; common operations are shared.
 
-    Where its first inputs, so many, are `moving`, before these stands how far rounding may move each of them
-    (`rounding`); zero for a line that is long.
+    If the first `moving` inputs are given, the rounding of each added output stands before these (`rounding`); it is
+    zero for a long line.
     """
     graph = Graph.from_line(program.line, len(program.line.nodes) + 2 * LARGEST_REWRITING * len(more.nodes) + 1000)
     with np.errstate(all="ignore"):

@@ -32,7 +32,7 @@ from lagjax._program._series import StraightLine
 from lagjax._program._small_equations import dot, eliminate, sparse_row, substitute
 
 BENT = "a constraint prescribes a speed that jumps"  # a reason to refuse a kick
-_BY_VELOCITY = "L or the momentum p = dL/dqdot jumps, and no law says with what velocities the motion goes on"
+_BY_VELOCITY = "L or the momentum p = dL/dqdot jumps, and no law gives the velocities after it"
 _NOT_QUADRATIC = (
     "L or the momentum p = dL/dqdot jumps, and L is not quadratic in qdot, so that the velocities behind that are not "
     "known in closed form"
@@ -80,7 +80,7 @@ class Kick(NamedTuple):
 def find_kicking(decided: DecidedProgram, count: int) -> dict[int, str | None]:
     """The pieces with which L or p jumps, each with the reason why no closed form holds there, or None.
 
-    The last outputs, so many, are the nodes of `Mechanics`.
+    The last `count` outputs are the nodes of `Mechanics`.
     """
     line, n, first = decided.line, decided.n, decided.first
     of, search, jumping = Mechanics.from_nodes(line.outputs[-count:], n), JumpSearch(decided), {}
@@ -113,9 +113,9 @@ def find_kicking(decided: DecidedProgram, count: int) -> dict[int, str | None]:
 def kick_of(
     line: StraightLine, n: int, size: int, decisions: Sequence[Decision], count: int, kicking: dict[int, str | None]
 ) -> Kick:
-    """The kick of a program of `size` inputs and the pieces, whose last outputs, so many, are those of `Mechanics`."""
+    """The kick of a program of `size` inputs and the pieces; its last `count` outputs are those of `Mechanics`."""
     spatial = [j for j in kicking if not inputs_below(line, [decisions[j].switch]).isdisjoint(range(n))]
-    # At corners where a constraint's rate jumps velocities are NaN: no law says with which the motion goes on.
+    # At corners where the rate of a constraint jumps, velocities are NaN: no law gives those after it.
     corners = [j for j in spatial if kicking[j] == BENT]
     refused = tuple((j, reason) for j, reason in kicking.items() if reason is not None and j not in corners)
     if refused:

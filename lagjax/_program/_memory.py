@@ -26,7 +26,7 @@ def operations_that_fit(bytes_each: int) -> int:
 
 
 def lack_of_memory(needed: float) -> str | None:
-    """The end of a sentence where so many bytes do not fit into the `SHARE` of a scene, else None."""
+    """The end of a sentence if `needed` bytes do not fit into the `SHARE` of a scene, else None."""
     there = machine_memory()
     if needed <= SHARE * there:
         return None

@@ -299,9 +299,9 @@ def _rest(graph, u: int, period: float) -> int:
 
 
 def _wholes(graph, u: int, period: float) -> int:
-    """The whole periods in u + ½ period; 2⁻⁵¹ of u is taken off, so that ±½ period as they are rounded have none.
+    """The number of whole periods in u + ½ period, 0 for u = ±½ period as rounded: u is reduced by 2⁻⁵¹ of itself.
 
-    NaN where there are so many that u says nothing of what is left.
+    NaN beyond `_MOST_WHOLE_TURNS`, where u does not determine the remainder.
     """
     f, number = graph.apply, lambda x: graph.constant(x, "float")
     wholes = f("floor", f("add", f("mul", number((1 - 2.0**-51) / period), u), number(0.5)))

@@ -1,6 +1,6 @@
 """`crossings`: where a function of the state changes sign along a motion.
 
-The motion is one run of machine code, which writes every crossing down and continues (`_native._events`).
+The motion is one run of machine code, which writes every crossing down and continues (`_native.steps._events`).
 """
 
 import functools
@@ -250,7 +250,7 @@ def surfaces_in(problem: Problem, functions, directions, names) -> Surfaces:
     except Unlowerable as reason:
         text = (
             f"crossings are found with machine code, and there is none for this scene: {reason}. In a large scene "
-            "simulate(..., event=…) stops at one, and goes on from there."
+            "simulate(..., event=…) stops at the first; a second call continues from it."
         )
         raise ValueError(text) from None
     for k in range(len(functions)):

@@ -2,11 +2,13 @@
 
 `_system` holds `System`; `_samples` inputs that were measured, as functions of time; `_explanation` what a scene
 contains, what was left out, and which engine takes it; `_contacts` the contacts of a scene in flat coordinates;
-`_closed_over` takes numbers that functions close over while they are traced, and makes them parameters.
+`_driven` makes parameters of the inputs that functions ask for, `_closed_over` of numbers that functions close over
+while they are traced.
 """
 
 from lagjax._scene._closed_over import lift_batch, lift_problem
 from lagjax._scene._contacts import Contacts, ContactScene, Flat, InContact, Shapes
+from lagjax._scene._driven import Driven, asking_for_inputs, drive_scene, held_inputs, push_by_inputs
 from lagjax._scene._explanation import Explanation
 from lagjax._scene._samples import HOLDS, MARGINS, continued, samples, unevenly_spaced
 from lagjax._scene._system import (

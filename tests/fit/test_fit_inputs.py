@@ -92,16 +92,21 @@ def test_machine_code_and_diffrax_agree_and_derivatives_are_those_of_differences
     form = _inputs.InputForm(*record_of(TS[:9], hold).input_structure, hold)
     pieces = [(TS[:9], inputs_of(TS[:9])[:, None]), (TS[3:8], inputs_of(TS[:5], 1)[:, None])]
     table, ts = _inputs.build_table(pieces, hold), np.stack([TS[0:7:3], TS[3:8:2]])
-    y0, numbers = np.array([[1.0, 0.0], [0.3, -1.0]]), parameters.first
+    y0, numbers = np.array([[1.0, 0.0], [0.3, -1.0]]), np.tile(parameters.first, (2, 1))
     y0_dot = np.concatenate([np.broadcast_to(np.eye(2), (2, 2, 2)), np.zeros((2, 3, 2))], axis=1)
-    along = y0_dot, np.concatenate([np.zeros((2, 3)), np.eye(3)])
+    along = y0_dot, np.tile(np.concatenate([np.zeros((2, 3)), np.eye(3)]), (2, 1, 1))
     fast = _motions.choose_motions(SCENE, layout, parameters, 1e-12, form)
     options = {"rtol": 1e-12, "atol": None, "adjoint": diffrax.ForwardMode()}
     plain = _motions._JaxMotions(form.drive_scene(SCENE), layout, parameters, options, True)
     one, other = (motions.follow(ts, y0, numbers, *along, table) for motions in (fast, plain))
     np.testing.assert_allclose(one.path, other.path, atol=1e-8)
     np.testing.assert_allclose(one.tangents, other.tangents, atol=1e-7)
-    at = pieces[0][0], np.repeat(y0[:1], 9, axis=0), numbers, _inputs.constant_tables(*pieces[0])
+    at = (
+        pieces[0][0],
+        np.repeat(y0[:1], 9, axis=0),
+        np.repeat(numbers[:1], 9, axis=0),
+        _inputs.constant_tables(*pieces[0]),
+    )
     np.testing.assert_allclose(fast.rate(*at), plain.rate(*at), rtol=1e-12)
     for k, step in enumerate(1e-5 * np.eye(3)):
         after, before = (fast.follow(ts, y0, numbers + way * step, *along, table).path for way in (1, -1))

@@ -29,7 +29,7 @@ from benchmarks._ptx import PtxOnCpu, outputs_of
 from lagjax import scenes
 from lagjax._engine.taylor import _gpu_launch, _primitives
 from lagjax._engine.taylor._call import call_host
-from lagjax._native._gpu import MOTION, TRANSPOSE, GpuForm, OneLane, form_for, grid, libdevice
+from lagjax._native.motions._gpu import MOTION, TRANSPOSE, GpuForm, OneLane, form_for, grid, libdevice
 
 TS, MACHINE_CODE = np.linspace(0.0, 1.0, 5), lagjax.MachineCode()
 translated = functools.lru_cache(maxsize=64)(PtxOnCpu)
@@ -108,7 +108,7 @@ def test_a_batch_is_that_of_the_cpu(on_the_ptx, monkeypatch, form):
     q0 = np.random.default_rng(0).uniform(-1.0, 1.0, (7, 2))
     batch = jax.vmap(lambda q0: motion(scene, q0, 0 * q0, rtol=1e-9))
     if form is not None:
-        monkeypatch.setattr("lagjax._native._gpu.form_for", lambda entry, lane, order: form)
+        monkeypatch.setattr("lagjax._native.motions._gpu.form_for", lambda entry, lane, order: form)
     *here, steps = on_the_ptx(batch, q0)
     *there, of_cpu = jax.jit(batch)(q0)
     agree(here, there)
@@ -233,7 +233,7 @@ def test_members_whose_steps_do_not_do_take_tangents(on_the_ptx, monkeypatch):
     agree(on_the_ptx(gradient, rest), jax.jit(gradient)(rest), 1e-7)
     assert sorted(on_the_ptx.launches) == [3, 3, 15]  # tangents by two states and three parameters of each
     on_the_ptx.launches.clear()
-    monkeypatch.setattr("lagjax._native._gpu.LARGEST_RECORD", 64 * 5 * 6)  # five steps
+    monkeypatch.setattr("lagjax._native.motions._gpu.LARGEST_RECORD", 64 * 5 * 6)  # five steps
     agree(on_the_ptx(gradient, rest + 1.0), jax.jit(gradient)(rest + 1.0), 1e-7)
     assert sorted(on_the_ptx.launches) == [3, 3, 15]
 
@@ -345,7 +345,7 @@ def program_of(scene, monkeypatch=None, unrolled=None):
     """The PTX of a scene's motion. Skips the test where libdevice is needed and not here."""
     programs = []
     if monkeypatch is not None:
-        monkeypatch.setattr("lagjax._native._gpu.form_for", lambda entry, lane, order: GpuForm(order, unrolled))
+        monkeypatch.setattr("lagjax._native.motions._gpu.form_for", lambda entry, lane, order: GpuForm(order, unrolled))
     transforms_are_new()
 
     def launch(entry, program, members, arrays, shapes):
@@ -446,7 +446,9 @@ def test_a_scene_that_cannot_go_to_a_gpu_says_why():
 
 @pytest.mark.slow
 def test_instructions_are_counted(monkeypatch):
-    monkeypatch.setattr("lagjax._native._gpu.form_for", lambda entry, lane, order: GpuForm(order, unrolled=False))
+    monkeypatch.setattr(
+        "lagjax._native.motions._gpu.form_for", lambda entry, lane, order: GpuForm(order, unrolled=False)
+    )
     # Of a pendulum's step at order 13: every product of two series of 13 terms alone has 91 products.
     gpu_estimate = importlib.import_module("benchmarks.gpu_estimate")
     counted = gpu_estimate.counted(gpu_estimate.Run(scenes.pendulum()))

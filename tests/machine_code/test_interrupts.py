@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import lagjax
-from lagjax._native import _threads
+from lagjax._native.motions import _threads
 
 SHORT, LONG, LIMIT = np.linspace(0, 1, 3), np.linspace(0, 1e9, 3), 10**9
 SCENE = lagjax.scenes.pendulum()

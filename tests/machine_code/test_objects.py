@@ -17,7 +17,7 @@ from lagjax import _native
 from lagjax._engine import Problem
 from lagjax._engine.taylor import flow_of
 from lagjax._interface import Layout
-from lagjax._native import _ir, _objects
+from lagjax._native.code import _ir, _objects
 
 SCENE = lagjax.scenes.spherical_pendulum()
 TS = np.linspace(0.0, 1.0, 5)

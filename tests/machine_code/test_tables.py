@@ -9,9 +9,9 @@ import lagjax
 from lagjax import _native
 from lagjax._equations import derivation_of, numbers_of
 from lagjax._interface import Layout
-from lagjax._native import _schedule, _taylor
-from lagjax._native._integrator import Integrator
-from lagjax._native._motion_parts import MotionParts
+from lagjax._native.motions._integrator import Integrator
+from lagjax._native.series import _schedule, _taylor
+from lagjax._native.series._motion_parts import MotionParts
 from lagjax._program import OPERATIONS, Unlowerable
 from lagjax._tracing import lower
 
@@ -41,7 +41,7 @@ def run_and_back(kernel, ts, y0, params):
     counts = np.where(run.complete, run.steps, 0)
     first = np.cumsum(counts) - counts
     cotangents = np.random.default_rng(0).normal(size=run.path.shape), np.ones_like(y0)
-    record = _native.StepRecord(run.table, first, counts, _native.order_for(RTOL))
+    record = _native.Steps(run.table, first, counts, _native.order_for(RTOL))
     return run, kernel.vjp(ts[None], params, record, *cotangents)
 
 

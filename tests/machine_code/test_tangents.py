@@ -11,7 +11,7 @@ from lagjax import _native
 from lagjax._engine import Problem
 from lagjax._engine.taylor import Tolerances, _derivatives, flow_of
 from lagjax._interface import Layout
-from lagjax._native import _kernel
+from lagjax._native.motions import _kernel
 
 TOLERANCES = Tolerances(1e-10, 1e-13, 4096)
 TS = np.array([[0.0, 0.4, 0.5, 1.3, 2.0]])
@@ -70,7 +70,7 @@ def test_straight_lines_and_tables_have_the_same_tangents(flow, monkeypatch):
     y0, numbers, rng = starts(2)
     dy0, dparams = rng.normal(size=(2, 5, 4)), rng.normal(size=(2, 5, 3))
     written = along(flow, y0, numbers, dy0, dparams)
-    for module in (_native._taylor, _native._recorded_steps):
+    for module in (_native.series._taylor, _native.motions._recorded_steps):
         monkeypatch.setattr(module, "is_large", lambda *_, **__: True)
     again = type(flow)(lambda: (flow.program, None), flow.size, flow.numbers)
     for a, b in zip(along(again, y0, numbers, dy0, dparams), written, strict=True):

@@ -166,7 +166,9 @@ class Line:
         """The code for a program of XLA, which is called often; LLVM may take longer for it."""
         for lanes in (LANES, 1) if is_wide and self.size + len(self.line.outputs) <= MOST_IN_LANES else (1,):
             if compilation_work(self.line, lanes) <= WORK_OF_JIT:
-                return self._make_code(largest=len(self.line.nodes) + len(self.line.outputs), lanes=lanes, shared=shared)
+                return self._make_code(
+                    largest=len(self.line.nodes) + len(self.line.outputs), lanes=lanes, shared=shared
+                )
         return self.code
 
     def _make_code(self, **settings: Any) -> LineCode | None:

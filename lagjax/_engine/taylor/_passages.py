@@ -7,13 +7,13 @@ time s is nothing to the motion. Its slope is one of s^0.5, and to tangents that
 
 import numpy as np
 
-from lagjax._engine.taylor._flow import Flow, Steps, Tolerances
-from lagjax._native import Kernel
+from lagjax._engine.taylor._flow import Flow, Tolerances
+from lagjax._native import Kernel, Steps
 from lagjax._program import eliminate_dead_code
 
 # The parts of a passage grow by `GROWTH`; of the first one, `NEAREST` of the passage, the slope is nothing either.
 GROWTH, NEAREST = 1.6, 1e-6
-_ROUNDING = 64 * np.finfo(float).eps  # parts of the time, or of coordinates, within which nobody knows where it is
+_ROUNDING = 64 * np.finfo(float).eps  # of the time, or of coordinates: rounding of a passage
 
 
 def has_passages(kernel: Kernel) -> bool:

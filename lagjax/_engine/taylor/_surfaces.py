@@ -1,7 +1,7 @@
 """Surfaces that a motion meets: guards as programs, and how the time and the state of a crossing vary.
 
-Where a guard vanishes is found by machine code, without derivatives (`_native._events`). Those of the crossing come
-from the implicit function: with g the guard and ġ its rate along the motion,
+Where a guard vanishes is found by machine code, without derivatives (`_native.steps._events`). Those of the crossing
+come from the implicit function: with g the guard and ġ its rate along the motion,
 
     dt* = −dg / ġ        dy* = dy + ẏ dt*
 

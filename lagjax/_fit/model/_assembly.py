@@ -56,7 +56,7 @@ def assemble_residuals(given: list[GivenSystem], parameters: Parameters, law: Ab
     for one in given:
         with errors_of_system(one.name):
             systems.append(_assemble_system(one, parameters, law))
-    return Residuals(systems)
+    return Residuals(systems, parameters)
 
 
 def _assemble_system(given: GivenSystem, parameters: Parameters, law: AbstractNoise) -> SystemResiduals:
@@ -96,7 +96,7 @@ def _assemble_system(given: GivenSystem, parameters: Parameters, law: AbstractNo
     elif has_constraints(system) and fitted.any():
         raise ValueError("A start on constraints of a scene with `inputs` cannot be fitted: give start=(q0, qdot0).")
     return SystemResiduals(
-        name, system, records, whole_pieces(records), fitted, motions, signals, parameters,
+        name, system, records, whole_pieces(records), fitted, motions, signals, parameters.restore,
         np.where(size > 0, size, 1.0), DEFAULT_RTOL, clocks, manifold, sensor,
     )  # fmt: skip
 

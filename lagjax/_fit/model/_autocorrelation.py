@@ -5,7 +5,6 @@ sum of the correlations over all lags. Source: Geyer, *Practical Markov chain Mo
 where correlations end; Newey & West, Econometrica 55 (1987) 703, for tapers whose spectrum has no negative parts.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -82,10 +81,9 @@ def close_gaps(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:
 
 
 def correlated_square(rows: np.ndarray, lags: np.ndarray) -> np.ndarray:
-    """Σ Gᵀ C G over N pieces `rows` (N, T, F), where C has the correlations `lags`."""
+    """GᵀC G of each of N pieces `rows` (N, T, L), (N, L, L), where C has the correlations `lags`."""
     if len(lags) == 1:
-        flat = rows.reshape(math.prod(rows.shape[:-1]), rows.shape[-1])
-        return flat.T @ flat
+        return rows.swapaxes(1, 2) @ rows
     lags = lags[: rows.shape[1]]
     size = rows.shape[1] + len(lags)
     kernel = np.zeros(size)
@@ -93,7 +91,7 @@ def correlated_square(rows: np.ndarray, lags: np.ndarray) -> np.ndarray:
     kernel[-np.arange(1, len(lags))] += lags[1:]
     spectrum = np.fft.rfft(kernel).real
     smooth = np.fft.irfft(np.fft.rfft(rows, size, axis=1) * spectrum[:, None], size, axis=1)[:, : rows.shape[1]]
-    return np.einsum("ntf,ntg->fg", rows, smooth)
+    return rows.swapaxes(1, 2) @ smooth
 
 
 def independent_share(residuals: Residuals, point: Trial, noise: NoiseScale) -> float:

@@ -86,8 +86,7 @@ class Density:
         """A vector (D,) taken apart."""
         u, starts = x[: len(self.residuals.parameters)], jnp.asarray(self.point.starts, x.dtype)
         starts = jnp.where(self.start_places < len(self), jnp.append(x, 0.0)[self.start_places], starts)
-        for part in self.residuals.parts:
-            starts = part.trace_starts(starts, self.params(u))
+        starts = self.residuals.trace_starts(starts, u)
         dof = jnp.asarray(self.noise.dof, x.dtype)
         if self.moves_dof:
             share = jax.nn.sigmoid(x[self.noise_places.stop :])
@@ -97,7 +96,7 @@ class Density:
     def params(self, x):
         """The user's pytree of parameters at x (D,), of which the first F numbers move them."""
         parameters = self.residuals.parameters
-        return parameters.restore(parameters.numbers(x[: len(parameters)], jnp))
+        return parameters.restore_records(parameters.numbers(x[: len(parameters)], jnp))
 
     @accepts_singles(("x",))
     def __call__(self, x):
@@ -130,9 +129,7 @@ class Density:
 
     def evaluate(self, at: PosteriorUnknowns) -> list:
         """The outputs of the sensors less the measurements, (N, T, S), of every batch."""
-        pairs = [(part, batch) for part in self.residuals.parts for batch in part.batches]
-        starts = [at.starts[part.frame.rows[batch.rows], : part.states] for part, batch in pairs]
-        return [part.trace_residuals(batch, at.u, y0) for (part, batch), y0 in zip(pairs, starts, strict=True)]
+        return self.residuals.trace(at.u, at.starts)
 
     def _noise_covariance(self, samples: np.ndarray) -> np.ndarray:
         """The covariance of log σ, and of the numbers that move ν, from Fisher's information of this many samples (S,).
@@ -160,10 +157,9 @@ class Density:
         robust = np.array([(d + 1) / (d + 3) if np.isfinite(d) else 1.0 for d in self.noise.dof])
         factors = [f * np.sqrt(self.shares * robust) for f in residuals.fisher_factors(point, self.noise)]
         triangles = residuals.triangles(point, factors)
-        free, size = len(point.u), self.noise_places.start
-        precision = np.zeros((len(self) + 1, len(self) + 1))
-        for own, triangle in zip(self.start_places, triangles, strict=True):
-            own = [*own, *range(free)]
+        free, size, columns = len(point.u), self.noise_places.start, residuals.unknowns.columns
+        precision, columns = np.zeros((len(self) + 1, len(self) + 1)), np.where(columns < free, columns, len(self))
+        for own, triangle in zip(np.concatenate([self.start_places, columns], axis=1), triangles, strict=True):
             precision[np.ix_(own, own)] += triangle[:, :-1].T @ triangle[:, :-1]
         precision = precision[:size, :size]
         scale = np.sqrt(np.diag(precision))

@@ -1,7 +1,7 @@
 """Sampled inputs of a scene, as tables that its functions look into.
 
-A scene whose functions ask for `inputs` becomes one whose functions ask for `t` and `params` alone: its parameters are
-those of the user and, beside them, one table of samples (`Driven`), in which the input at the time t is looked up
+A scene whose functions ask for `inputs` becomes one whose functions ask for `t` and `params` alone (`drive_scene`): its
+parameters are those of the user and, beside them, one table of samples, in which the input at the time t is looked up
 (`lagjax.samples`). So a step of machine code ends at every sample, each member of a batch has a table of its own, and
 derivatives go along the user's parameters only. Tables are filled up to a few lengths (`table_length`): a program is
 made for a length, and serves all records.
@@ -11,19 +11,15 @@ import functools
 import math
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._interface import Function
-from lagjax._interface.reads import Edition
 from lagjax._run.hybrid import Scene, laws
-from lagjax._scene import MARGINS, System, continued, samples
+from lagjax._scene import MARGINS, Driven, System, asking_for_inputs, continued, drive_scene, samples
 
 PyTree = Any
 _LEAST_ROOM, _GROWTH = 16, 4  # of tables: at most four times what is needed, and six programs up to 16 000 samples
-_FUNCTIONS = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
 
 
 class SampleTable(NamedTuple):
@@ -43,14 +39,6 @@ class SampleTable(NamedTuple):
         return np.concatenate(parts, axis=1)
 
 
-class Driven(NamedTuple):
-    """The parameters of a scene with inputs: those of the user, and the table (K,) and (K, I)."""
-
-    params: PyTree
-    knots: Any
-    values: Any
-
-
 class InputForm(NamedTuple):
     """The structure of an input at one time, and its interpolation between samples, one of `_samples.HOLDS`."""
 
@@ -65,24 +53,23 @@ class InputForm(NamedTuple):
     def restore(self, flat) -> PyTree:
         return split_leaves(flat, self.tree, self.shapes)
 
+    def __call__(self, table: "SampleTable", t) -> PyTree:
+        """The inputs at the time t, by the table of one piece."""
+        return self.restore(samples(table.knots, table.values, self.hold)(t))
+
     def drive_scene(self, system: System) -> System:
-        present, wrapped = [name for name in _FUNCTIONS if getattr(system, name) is not None], []
-        for function in (getattr(system, name) for name in present):
-            arrays, code = eqx.partition(_FunctionOfInputs(function, self), eqx.is_array)
-            extras = tuple(x for x in dict.fromkeys(("t", "params", *function.extras)) if x != "inputs")
-            wrapped.append(Function(arrays, Edition.from_function(code), extras))
-        return eqx.tree_at(lambda s: [getattr(s, name) for name in present], system, wrapped)
+        return drive_scene(system, self, ("t", "params"))
 
     def bind_samples(self, system: Scene, params: PyTree, ts: np.ndarray, inputs: np.ndarray) -> tuple[Scene, PyTree]:
         """The scene with inputs (K, I) sampled at `ts` (K,), and its parameters, as `simulate` takes them."""
         if not input_functions(system) or not isinstance(system, System):
             return system, params
         table = build_table([(ts, inputs)], self.hold)
-        return self.drive_scene(system), Driven(params, table.knots[0], table.values[0])
+        return self.drive_scene(system), Driven(params, SampleTable(table.knots[0], table.values[0]))
 
     def params(self, params: PyTree, room: int) -> Driven:
         """Parameters of the driven scene, with a table of zeros of this many instants: a structure."""
-        return Driven(params, np.arange(float(room)), np.zeros((room, self.size)))
+        return Driven(params, SampleTable(np.arange(float(room)), np.zeros((room, self.size))))
 
 
 def split_leaves(flat, tree, shapes: tuple[tuple[int, ...], ...]) -> PyTree:
@@ -92,26 +79,8 @@ def split_leaves(flat, tree, shapes: tuple[tuple[int, ...], ...]) -> PyTree:
     return tree.unflatten([part.reshape(part.shape[:-1] + shape) for part, shape in zip(parts, shapes, strict=True)])
 
 
-class _FunctionOfInputs(eqx.Module):
-    """A function of the user, for parameters that are `Driven`."""
-
-    function: Function
-    form: InputForm = eqx.field(static=True)
-
-    @property
-    def __name__(self) -> str:
-        return self.function.name
-
-    def __call__(self, *roles, t, params: Driven, **more):
-        extras = {"t": t, "params": params.params, **more}
-        if "inputs" in self.function.extras:
-            extras["inputs"] = self.form.restore(samples(params.knots, params.values, self.form.hold)(t))
-        return self.function(*roles, **extras)
-
-
 def input_functions(scene: Scene) -> list[str]:
-    functions = ((name, getattr(law, name)) for law in laws(scene) for name in _FUNCTIONS)
-    return [name for name, function in functions if function is not None and "inputs" in function.extras]
+    return [role for law in laws(scene) for role in asking_for_inputs(law)]
 
 
 def table_length(count: int) -> int:

@@ -25,7 +25,7 @@ import numpy as np
 
 from lagjax._engine import Problem, choose
 from lagjax._engine.taylor import Flow, MachineCode, Motions, flow_of, jvp, project_start_tangents, tolerances_of
-from lagjax._fit.model._inputs import Driven, InputForm, SampleTable, input_functions
+from lagjax._fit.model._inputs import InputForm, SampleTable, input_functions
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import start_pair
 from lagjax._interface import ENDED_WELL, Layout, halves
@@ -33,7 +33,7 @@ from lagjax._native import Projection
 from lagjax._primitives import sentence
 from lagjax._run import simulate
 from lagjax._run.hybrid import Scene, first_law, jumps
-from lagjax._scene import System
+from lagjax._scene import Driven, System
 
 PyTree = Any
 
@@ -70,15 +70,14 @@ class AbstractMotions(abc.ABC):
         self, ts: np.ndarray, y0: np.ndarray, numbers: np.ndarray, y0_dot: np.ndarray, numbers_dot: np.ndarray,
         table: SampleTable | None = None,
     ) -> RecordMotion:  # fmt: skip
-        """The motions from `y0` (N, 2n) at `ts` (N, T) for all parameters `numbers` (P,) and a table of inputs a row.
+        """The motions from `y0` (N, 2n) at `ts` (N, T), with parameters `numbers` (N, P) and a table of inputs a row.
 
-        Tangents go along `y0_dot` (N, D, 2n) and `numbers_dot` (D, P). Rows may have parameters of their own, (N, P)
-        and (N, D, P).
+        Tangents go along `y0_dot` (N, D, 2n) and `numbers_dot` (N, D, P).
         """
 
     @abc.abstractmethod
     def rate(self, t: np.ndarray, y: np.ndarray, numbers: np.ndarray, table: SampleTable | None = None) -> np.ndarray:
-        """q̈ (M, n) at M states `y` (M, 2n) and times `t` (M,), with a table of inputs for each."""
+        """q̈ (M, n) at M states `y` (M, 2n) and times `t` (M,), with parameters (M, P) and a table of inputs each."""
 
 
 def choose_motions(
@@ -90,7 +89,7 @@ def choose_motions(
     scene = system if form is None else form.drive_scene(system)
 
     def problem(room: int) -> Problem:
-        params = parameters.restore(parameters.first)
+        params = parameters.restore(parameters.example)
         return Problem.from_system(scene, layout, params if form is None else form.params(params, room), rtol=rtol)
 
     if isinstance(choose(problem(2)).engine, MachineCode):
@@ -108,7 +107,7 @@ class _MachineCodeMotions(AbstractMotions):
     def _flow(self, numbers: np.ndarray, table: SampleTable | None) -> tuple[Flow, np.ndarray]:
         """The flow of the scene with inputs of this room, made once for all that are equal, and its parameters."""
         if table is None or not self.is_driven:
-            return flow_of(self.problem(2)), np.atleast_2d(numbers)
+            return flow_of(self.problem(2)), numbers
         return flow_of(self.problem(table.room)), table.rows(numbers)
 
     def follow(self, ts, y0, numbers, y0_dot, numbers_dot, table=None):
@@ -144,8 +143,6 @@ class _JaxMotions(AbstractMotions):
         self.dtype = layout.dtype
 
     def follow(self, ts, y0, numbers, y0_dot, numbers_dot, table=None):
-        numbers = np.broadcast_to(numbers, (len(y0), numbers.shape[-1]))
-        numbers_dot = np.broadcast_to(numbers_dot, (*y0_dot.shape[:2], numbers.shape[-1]))
         arrays = jax.tree.map(self._array, (ts, y0, numbers, y0_dot, numbers_dot, table))
         (path, result, t_end, y_end), tangents = jax.tree.map(np.asarray, self._follow(*arrays))
         return RecordMotion(path.astype(float), tangents.astype(float), result, t_end, y_end)
@@ -160,11 +157,11 @@ class _JaxMotions(AbstractMotions):
 @functools.lru_cache(maxsize=16)
 def _programs_once(scene: Scene, layout: Layout, tree, leaves: tuple, options: tuple, is_driven: bool):
     """The motions with their tangents and the accelerations of many rows: compiled once for the fits of a scene."""
-    restore = Parameters([np.zeros(*leaf) for leaf in leaves], tree, np.zeros(0), (), ()).restore
+    restore = Parameters([np.zeros(*leaf) for leaf in leaves], tree, *np.zeros((3, 0)), (), ()).restore
 
     def scene_params(numbers, table):
         params = restore(numbers)
-        return Driven(params, *table) if is_driven else params
+        return Driven(params, table) if is_driven else params
 
     def run(state, ts, table):
         y0, numbers = state
@@ -185,7 +182,7 @@ def _programs_once(scene: Scene, layout: Layout, tree, leaves: tuple, options: t
         q, qdot = map(layout.restore, halves(y))
         return layout.flatten(first_law(scene).acceleration(q, qdot, t, scene_params(numbers, table)))
 
-    return jax.jit(jax.vmap(run_with_tangents)), jax.jit(jax.vmap(rate, in_axes=(0, 0, None, 0)))
+    return jax.jit(jax.vmap(run_with_tangents)), jax.jit(jax.vmap(rate))
 
 
 _STEPS, _STILL = 30, 1e-13  # of Newton's method, which squares the distance; and the change at which it has ended
@@ -194,12 +191,13 @@ _STEPS, _STILL = 30, 1e-13  # of Newton's method, which squares the distance; an
 class Origins:
     """The pieces whose starts are functions of the parameters, and these functions, compiled once."""
 
-    def __init__(self, starts: list, layout: Layout, parameters: Parameters):
-        """`starts` is what the record of each piece says of its start; None where the piece begins later."""
+    def __init__(self, starts: list, layout: Layout, restore: Callable[[Any], Any]):
+        """`starts` is what the record of each piece says of its start; None where the piece begins later. `restore`
+        makes parameters of their numbers."""
 
         def compile_start(function):
             def state(numbers):
-                q, qdot = start_pair(function, parameters.restore(numbers))
+                q, qdot = start_pair(function, restore(numbers))
                 return jnp.concatenate([layout.flatten(q), layout.flatten(qdot)])
 
             return jax.jit(lambda numbers: (state(numbers), jax.jacfwd(state)(numbers)))
@@ -209,14 +207,11 @@ class Origins:
         self.dtype = layout.dtype
 
     def move(self, starts: np.ndarray, numbers: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The starts (N, 2n) at the parameters `numbers` (P,), and tangents (N, F, 2n) along `directions` (F, P)."""
-        starts, moved = starts.copy(), np.zeros((len(starts), len(directions), starts.shape[1]))
-        made: dict = {}
+        """The starts (N, 2n) at parameters `numbers` (N, P), and tangents (N, L, 2n) along `directions` (N, L, P)."""
+        starts, moved = starts.copy(), np.zeros((*directions.shape[:2], starts.shape[1]))
         for k, function in self.functions.items():
-            if function not in made:
-                made[function] = [np.asarray(x, float) for x in function(numbers.astype(self.dtype))]
-            starts[k], slopes = made[function]
-            moved[k] = directions @ slopes.T
+            starts[k], slopes = (np.asarray(x, float) for x in function(numbers[k].astype(self.dtype)))
+            moved[k] = directions[k] @ slopes.T
         return starts, moved
 
 
@@ -238,26 +233,25 @@ class Manifold:
 
     def project(self, y: np.ndarray, t: np.ndarray, numbers: np.ndarray, directions: np.ndarray) -> tuple:
         """Consistent states near `y` (N, 2n) at the times `t` (N,), NaN without one, with their derivatives by y (N,
-        2n, 2n) and along F directions of the parameters (N, F, 2n)."""
+        2n, 2n) and along directions (N, L, P) of the parameters (N, P), which are (N, L, 2n)."""
         if self.projection is not None:
             return _project_by_newton(self.projection, y, t, numbers, directions)
         y, t, numbers = (np.asarray(x, self.dtype) for x in (y, t, numbers))
-        rows = [self._project(y[k], t[k], numbers) for k in range(len(y))]
+        rows = [self._project(*row) for row in zip(y, t, numbers, strict=True)]
         starts, by_y, by_numbers = (np.stack([np.asarray(x, float) for x in part]) for part in zip(*rows, strict=True))
-        return starts, by_y, np.einsum("nip,fp->nfi", by_numbers, directions)
+        return starts, by_y, np.einsum("nip,nlp->nli", by_numbers, directions)
 
 
 def _project_by_newton(projection: Projection, y: np.ndarray, t: np.ndarray, numbers: np.ndarray, directions) -> tuple:
-    (count, states), rows = y.shape, np.broadcast_to(numbers, (len(y), len(numbers)))
+    (count, states), more = y.shape, directions.shape[1]
     before = np.full_like(y, np.inf)
     for _ in range(_STEPS):
         if np.nanmax(np.abs(y - before), initial=0.0) <= _STILL * np.nanmax(np.abs(y), initial=0.0):
             break
-        before, y = y, projection.state.line.evaluate([*y.T, t, *rows.T]).T
+        before, y = y, projection.state.line.evaluate([*y.T, t, *numbers.T]).T
     still = np.abs(y - before).max(axis=1) <= _STILL * np.abs(y).max(axis=1)
     y = np.where(still[:, None], y, np.nan)
-    y_dot = np.zeros((count, states + len(directions), states))
-    rows_dot = np.zeros((count, states + len(directions), len(numbers)))
+    y_dot, rows_dot = np.zeros((count, states + more, states)), np.zeros((count, states + more, numbers.shape[1]))
     y_dot[:, :states], rows_dot[:, states:] = np.eye(states), directions
-    moved = project_start_tangents(projection, t[:, None], y, rows, y_dot, rows_dot)
+    moved = project_start_tangents(projection, t[:, None], y, numbers, y_dot, rows_dot)
     return y, moved[:, :states].swapaxes(1, 2), moved[:, states:]

@@ -1,15 +1,21 @@
 """Parameters: the numbers that are fitted, their names, and the transform of each.
 
-The scene's parameters are a pytree of any structure. Its P numbers end to end are one vector; F of them are free, and
-the search moves these through their transforms.
+The scene's parameters are a pytree of any structure. Its P numbers end to end are one vector; F unknowns move those
+that are free through their transforms.
+
+**Numbers of records.** A leaf that is `per_record` has one value for each of R records, end to end among all numbers;
+the scene sees one of them. So all numbers are a longer vector, of which every record has P, at its own places, and a
+record depends on the unknowns that all share and on its own: its `columns` among the F.
 """
 
 import functools
+import re
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from lagjax._fit.model._transforms import AbstractTransform, Unbounded
@@ -18,13 +24,41 @@ from lagjax._interface import as_arrays, labelled_leaves, require_finite
 PyTree = Any
 
 
+class _PerRecord:
+    """In `free` of `lagjax.fit`: the number, or each number of the array, has a value of its own in every record.
+
+    An offset, a gain, a delay, a clock or a start that differs from recording to recording, while the others are
+    shared. The scene's functions see the number of the record that they follow; `fit.params` has the records as first
+    axis there, in the order of `records`, those of several systems one after another.
+
+    ```python
+    import numpy as np, lagjax
+
+    scene = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2)
+    ts = np.linspace(0.0, 5.0, 101)
+    records = [lagjax.Record(ts, a * np.cos(1.5 * ts) + 0.1 * a) for a in (0.5, 1.0)]
+    shown = lambda q, qdot, params: q + params["offset"]
+    free = {"k": True, "offset": lagjax.per_record}
+    fit = lagjax.fit(scene, records, {"k": 2.0, "offset": 0.0}, observe=shown, free=free)
+    print(fit.params["offset"])  # [0.05 0.1]
+    ```
+    """
+
+    def __repr__(self) -> str:
+        return "lagjax.per_record"
+
+
+per_record = _PerRecord()
+
+
 class Part(NamedTuple):
-    """The numbers of one leaf that are free: where they stand among all numbers, and how they may move."""
+    """The numbers of one leaf that are free: where they stand among all numbers, how they may move, and the record of
+    each unknown that moves them, −1 for all records."""
 
     label: str
-    shape: tuple[int, ...]
     places: np.ndarray
     transform: AbstractTransform
+    owners: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -32,7 +66,8 @@ class Parameters:
     """The numbers of a pytree of parameters, and those among them that are free.
 
     - `leaves`, `tree`: the pytree with arrays for numbers; a leaf that is no number is a part of the program.
-    - `first` (P,): all numbers at the start of the search.
+    - `first`: all numbers at the start of the search; `places` (R, P): where those of every record stand among them.
+    - `owners` (R,): the record of the user whose numbers each has.
     - `names` (X,): what the free numbers are called, `params['m']`.
     - `parts`: the leaves among them, each with its transform. All of their u end to end are the F unknowns.
     """
@@ -40,88 +75,136 @@ class Parameters:
     leaves: list
     tree: Any
     first: np.ndarray
+    places: np.ndarray
+    owners: np.ndarray
     names: tuple[str, ...]
     parts: tuple[Part, ...]
 
     @classmethod
-    def from_pytree(cls, params: PyTree, free: PyTree = None, transforms: PyTree = None) -> "Parameters":
-        """The parameters of the user; `free` and `transforms` are prefixes. Raises, and names the wrong one."""
+    def from_pytree(
+        cls, params: PyTree, free: PyTree = None, transforms: PyTree = None, records: int = 1
+    ) -> "Parameters":
+        """The parameters of the user, of this many records; `free` and `transforms` are prefixes. Raises, and names the
+        wrong one."""
         require_finite(params, "params0")
         labels, leaves, tree = labelled_leaves(as_arrays(params, np.float64, "params0"), "params")
         is_free = _broadcast_prefix(True if free is None else free, tree, leaves, "free")
         moved_by = _broadcast_prefix(Unbounded() if transforms is None else transforms, tree, leaves, "transforms")
-        numbers, names, parts, count = [], [], [], 0
+        numbers, places, names, parts, count = [np.zeros(0)], [np.zeros((records, 0), int)], [], [], 0
         for label, leaf, may_move, transform in zip(labels, leaves, is_free, moved_by, strict=True):
             if not eqx.is_array_like(leaf):
                 continue
-            values = np.asarray(leaf, np.float64).ravel()
-            numbers.append(values)
-            fitted = _fitted_mask(label, leaf, may_move, free)
-            if fitted.any():
-                shape = np.shape(leaf)
-                for one, some in _split_by_transform(label, transform, fitted, shape):
-                    if isinstance(one, AbstractTransform) and not (len(some) == values.size or one.separable):
-                        raise ValueError(f"{label} is free as a whole or not at all: its transform is {one!r}.")
-                    one = _specialize_transform(label, one, values[some], shape)
-                    parts.append(Part(label, shape, count + some, one))
-                ends = [f"[{', '.join(map(str, index))}]" if shape else "" for index in np.ndindex(shape)]
-                names += [label + end for end, free_too in zip(ends, fitted, strict=True) if free_too]
-            count += values.size
+            fitted, values = _fitted_mask(label, leaf, may_move, free), np.asarray(leaf, np.float64).ravel()
+            shape, copies = np.shape(leaf), 1
+            if may_move is per_record and fitted.any():
+                copies = _require_several(label, records)
+                shape = copies, *shape
+            own = _split_leaf(label, np.shape(leaf), values, transform, fitted, count, copies) if fitted.any() else []
+            for place in np.concatenate([np.zeros(0, int), *(part.places for part in own)]):
+                index = np.unravel_index(place - count, shape)
+                names.append(f"{label}[{', '.join(map(str, index))}]" if shape else label)
+            parts += own
+            numbers.append(np.tile(values, copies))
+            each = count + np.arange(copies * values.size).reshape(copies, -1)
+            places.append(np.broadcast_to(each, (records, values.size)))
+            count += copies * values.size
         if not names and free is None:
             raise ValueError(
                 "No parameter is free: give params0 at least one float for which `free` is True, or free=False to fit "
                 "starts and noise alone."
             )
-        return cls(leaves, tree, np.concatenate([np.zeros(0), *numbers]), tuple(names), tuple(parts))
+        every = np.concatenate(places, axis=1)
+        return cls(leaves, tree, np.concatenate(numbers), every, np.arange(records), tuple(names), tuple(parts))
+
+    def select(self, rows) -> "Parameters":
+        """The same parameters for records each of which has the numbers of the record `rows` (M,) of these."""
+        return replace(self, places=self.places[rows], owners=self.owners[rows])
 
     @functools.cached_property
     def _cuts(self) -> list[tuple[slice, slice, Part]]:
         cuts, begin, u_begin = [], 0, 0
         for part in self.parts:
-            size = part.transform.count_unknowns(len(part.places))
+            size = len(part.owners)
             cuts.append((slice(u_begin, u_begin + size), slice(begin, begin + len(part.places)), part))
             begin, u_begin = begin + len(part.places), u_begin + size
         return cuts
 
     @functools.cached_property
-    def places(self) -> np.ndarray:
+    def free_places(self) -> np.ndarray:
         """The places of the free numbers among all (X,)."""
         return np.concatenate([np.zeros(0, int), *(part.places for part in self.parts)])
+
+    @functools.cached_property
+    def _owner_of(self) -> np.ndarray:
+        """The record whose numbers each unknown (F,) moves, −1 for those of all records."""
+        return np.concatenate([np.zeros(0, int), *(part.owners for part in self.parts)])
+
+    @functools.cached_property
+    def unknowns(self) -> "Unknowns":
+        """The unknowns that the numbers of each record depend on."""
+        own = [np.flatnonzero(self._owner_of == owner) for owner in self.owners]
+        room, shared = max(map(len, own), default=0), np.flatnonzero(self._owner_of < 0)
+        filled = [np.append(some, np.full(room - len(some), len(self))) for some in own]
+        rows = [np.append(some, shared) for some in filled]
+        return Unknowns(np.array(rows, int).reshape(len(own), -1), self.owners, room, len(self))
 
     def __len__(self) -> int:
         """F, the number of unknowns."""
         return self._cuts[-1][0].stop if self.parts else 0
 
     def inverse(self, values: np.ndarray) -> np.ndarray:
-        """The unknowns u (F,) at which the free ones among all `values` (P,) stand."""
+        """The unknowns u (F,) at which the free ones among all `values` stand."""
         return np.concatenate([np.zeros(0), *(part.transform.inverse(values[part.places]) for part in self.parts)])
 
     def numbers(self, u, xp: Any = np):
-        """All numbers (P,) where the free ones stand at u (F,)."""
+        """All numbers where the free ones stand at u (F,)."""
         if xp is np:
             values = self.first.copy()
-            values[self.places] = self.values(u)
+            values[self.free_places] = self.values(u)
             return values
-        return xp.asarray(self.first, u.dtype).at[self.places].set(self.values(u, xp))
+        return xp.asarray(self.first, u.dtype).at[self.free_places].set(self.values(u, xp))
 
     def values(self, u, xp: Any = np):
         """The free numbers (X,) at u (F,); infinite where a step of the search led too far, which is a lost trial."""
         with np.errstate(over="ignore", invalid="ignore"):
             return xp.concatenate([u[:0], *[part.transform.value(u[own], xp) for own, _, part in self._cuts]])
 
+    def _slopes(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The derivatives of the free numbers by u that are not zero by construction: rows, columns, and values."""
+        rows, columns, values = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0)]
+        for own, free, part in self._cuts:
+            with np.errstate(over="ignore", invalid="ignore"):
+                i, j, slopes = part.transform.slopes(u[own])
+            rows.append(free.start + i)
+            columns.append(own.start + j)
+            values.append(slopes)
+        return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
+
     def jacobian(self, u: np.ndarray) -> np.ndarray:
         """The derivative of the free numbers by u, (X, F)."""
-        matrix = np.zeros((len(self.names), len(self)))
-        for own, rows, part in self._cuts:
-            with np.errstate(over="ignore", invalid="ignore"):
-                matrix[rows, own] = part.transform.jacobian(u[own])
+        matrix, (rows, columns, values) = np.zeros((len(self.names), len(self))), self._slopes(u)
+        matrix[rows, columns] = values
         return matrix
 
+    @functools.cached_property
+    def _seen(self) -> tuple[np.ndarray, ...]:
+        """The places of derivatives in `directions`, (record, column, number), and which of `_slopes` each is."""
+        rows, columns, _ = self._slopes(self.inverse(self.first))
+        found = []
+        for record, (places, own) in enumerate(zip(self.places, self.unknowns.columns, strict=True)):
+            number, column = np.full(len(self.first), -1), np.full(len(self) + 1, -1)
+            number[places], column[own] = np.arange(len(places)), np.arange(len(own))
+            number, column = number[self.free_places[rows]], column[columns]
+            which = np.flatnonzero((number >= 0) & (column >= 0))
+            found.append(np.stack([np.full(len(which), record), column[which], number[which], which]))
+        return tuple(np.concatenate(found, axis=1))
+
     def directions(self, u: np.ndarray) -> np.ndarray:
-        """The derivative of all numbers by u, with a row for each unknown, (F, P)."""
-        rows = np.zeros((len(self), len(self.first)))
-        rows[:, self.places] = self.jacobian(u).T
-        return rows
+        """The derivatives of the numbers of every record by the unknowns that these depend on, (R, L, P)."""
+        found = np.zeros((*self.unknowns.columns.shape, self.places.shape[1]))
+        *places, which = self._seen
+        found[tuple(places)] = self._slopes(u)[2][which]
+        return found
 
     def ends(self, u: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The ends (X,) of intervals of the free numbers at u (F,), of half widths `spread` (X,), inside their sets."""
@@ -145,7 +228,9 @@ class Parameters:
         return sum(part.transform.log_volume(u[own], xp) for own, _, part in self._cuts)
 
     def draw(self, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        return np.concatenate([u[:0], *(part.transform.draw(u[own], rng) for own, _, part in self._cuts)])
+        """Another place (F,) to begin a search from; the numbers of one record, like its start, follow the others."""
+        drawn = np.concatenate([u[:0], *(part.transform.draw(u[own], rng) for own, _, part in self._cuts)])
+        return np.where(self._owner_of < 0, drawn, u)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -213,19 +298,41 @@ class Parameters:
             )
         return own.start + row - rows.start
 
-    def fix(self, u: np.ndarray, which: int | None = None) -> "Parameters":
-        """The parameters at u (F,), where the unknown `which` of a number of its own is kept there; None: all are."""
+    def fix(self, u: np.ndarray, kept: np.ndarray) -> "Parameters":
+        """The parameters at u (F,), where the unknowns `kept` (F,) stay: each of them moves a number of its own, or
+        stays with all others of its leaf."""
         parts, names = [], []
-        for own, rows, part in [] if which is None else self._cuts:
-            keep = np.ones(len(part.places), bool)
-            if own.start <= which < own.stop:
-                keep[which - own.start] = False
-            if keep.any():
-                parts.append(part._replace(places=part.places[keep]))
-            names += [name for name, stays in zip(self.names[rows], keep, strict=True) if stays]
+        for own, rows, part in self._cuts:
+            stays = kept[own] if part.transform.separable else np.full(len(part.places), kept[own].all())
+            if not stays.all():
+                owners = part.owners[~stays] if part.transform.separable else part.owners
+                parts.append(part._replace(places=part.places[~stays], owners=owners))
+            names += [name for name, kept_too in zip(self.names[rows], stays, strict=True) if not kept_too]
         return replace(self, first=self.numbers(u), parts=tuple(parts), names=tuple(names))
 
+    def extend(self, u: np.ndarray, rows: slice) -> tuple["Parameters", np.ndarray]:
+        """The parameters of one more record with numbers of its own, and u (F,) where these are in the middle of those
+        of the records `rows`."""
+        own, moved = self.unknowns.columns[rows, : self.unknowns.own], np.append(u, 0.0)
+        moved[own[0]] = moved[own].mean(axis=0)
+        return self.select([rows.start]), moved[:-1]
+
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """The names of the free numbers (X,) without the record: `params['bias']`, or `params['bias'][:, 0]`."""
+        found = list(self.names)
+        for _, rows, part in self._cuts:
+            for k in range(rows.start, rows.stop) if part.owners.max() >= 0 else ():
+                found[k] = re.sub(r"\[\d+(?:, )?([\d, ]*)\]$", lambda m: f"[:, {m[1]}]" if m[1] else "", found[k])
+        return tuple(found)
+
+    @property
+    def example(self) -> np.ndarray:
+        """The first numbers (P,) of one record."""
+        return self.first[self.places[0]]
+
     def restore(self, numbers) -> PyTree:
+        """The parameters as the scene's functions see them, from the numbers (P,) of one record."""
         leaves, begin = [], 0
         for leaf in self.leaves:
             if eqx.is_array_like(leaf):
@@ -234,6 +341,81 @@ class Parameters:
                 begin = end
             leaves.append(leaf)
         return jax.tree.unflatten(self.tree, leaves)
+
+    def restore_records(self, numbers) -> PyTree:
+        """The parameters from all numbers: with the records as first axis where each has a number of its own."""
+        if not (self.places != self.places[0]).any():
+            return self.restore(numbers)
+        each = [self.restore(numbers[places]) for places in self.places]
+        own = iter((self.places != self.places[0]).any(axis=0))
+
+        def combine(leaf, *others):
+            if not eqx.is_array_like(leaf):
+                return leaf
+            differs = any([next(own) for _ in range(np.size(leaf))])
+            return (jnp if isinstance(leaf, jax.Array) else np).stack([leaf, *others]) if differs else leaf
+
+        return jax.tree.map(combine, *each)
+
+
+class Unknowns(NamedTuple):
+    """The unknowns, of F in all, that the numbers of each of R records depend on.
+
+    - `columns` (R, L): their places among all; F stands for none.
+    - `owners` (R,): whose the first `own` of them are. Those behind are shared by all records.
+    """
+
+    columns: np.ndarray
+    owners: np.ndarray
+    own: int
+    count: int
+
+    @property
+    def shared(self) -> np.ndarray:
+        """The places of the shared unknowns (L − own,)."""
+        return self.columns[0, self.own :]
+
+    def select(self, rows) -> "Unknowns":
+        return self._replace(columns=self.columns[rows], owners=self.owners[rows])
+
+    def spread(self, local: np.ndarray) -> np.ndarray:
+        """Rows (R, ..., L) of columns of records as rows (R, ..., F) of columns of all unknowns."""
+        found = np.zeros((*local.shape[:-1], self.count + 1))
+        for own, columns, row in zip(found, self.columns, local, strict=True):
+            own[..., columns] = row
+        return found[..., :-1]
+
+    def add(self, squares: np.ndarray) -> np.ndarray:
+        """The sum (F, F) of matrices (R, L, L) of the columns of records."""
+        total = np.zeros((self.count + 1, self.count + 1))
+        for columns, square in zip(self.columns, squares, strict=True):
+            total[np.ix_(columns, columns)] += square
+        return total[:-1, :-1]
+
+    def norms(self, lengths: np.ndarray) -> np.ndarray:
+        """The lengths (F,) of the columns of all unknowns from those of records (R, L), also where squares are no
+        numbers."""
+        largest, total = np.zeros((2, self.count + 1))
+        np.maximum.at(largest, self.columns, lengths)
+        unit = np.where(largest > 0, largest, 1.0)
+        np.add.at(total, self.columns, (lengths / unit[self.columns]) ** 2)
+        return (np.sqrt(total) * unit)[:-1]
+
+    def stack_by_owner(self, rows: np.ndarray) -> np.ndarray:
+        """The rows (R, M, C) of records that have the same numbers below each other, (O, M′, C), filled with zeros."""
+        owners, which = np.unique(self.owners, return_inverse=True)
+        counts = np.bincount(which)
+        if (counts == 1).all():
+            return rows[np.argsort(which)]
+        order = np.argsort(which, kind="stable")
+        found = np.zeros((len(owners), counts.max(), *rows.shape[1:]))
+        found[which[order], np.concatenate([np.arange(count) for count in counts])] = rows[order]
+        return found.reshape(len(owners), -1, rows.shape[-1])
+
+    @property
+    def of_owners(self) -> np.ndarray:
+        """The columns of each owner (O, own), in the order of `stack_by_owner`."""
+        return self.columns[np.unique(self.owners, return_index=True)[1], : self.own]
 
 
 def _broadcast_prefix(prefix: PyTree, tree, leaves: list, name: str) -> list:
@@ -248,21 +430,45 @@ def _broadcast_prefix(prefix: PyTree, tree, leaves: list, name: str) -> list:
         ) from None
 
 
+def _require_several(label: str, records: int) -> int:
+    if records < 2:
+        raise ValueError(f"{label} is lagjax.per_record, and there is one record: say True, which is the same.")
+    return records
+
+
 def _fitted_mask(label: str, leaf, may_move, free) -> np.ndarray:
     """True for each number of a leaf (n,) that is fitted. Raises where the user asks to fit one that cannot move."""
-    wanted = np.asarray(may_move)
+    wanted = np.asarray(True if may_move is per_record else may_move)
     if wanted.dtype != bool:
-        raise TypeError(f"free must hold True or False; got {may_move!r} for {label}.")
+        raise TypeError(f"free must hold True or False, or lagjax.per_record; got {may_move!r} for {label}.")
     if wanted.shape not in ((), np.shape(leaf)):
         raise ValueError(
             f"free must hold True, False, or an array of them of the shape {np.shape(leaf)} for {label}; got one of "
             f"the shape {wanted.shape}."
         )
     if not np.issubdtype(np.asarray(leaf).dtype, np.floating):
-        if wanted.any() and free is not None and free is not True:
+        if wanted.any() and not any(free is whole for whole in (None, True, per_record)):
             raise TypeError(f"{label} is free but not a float: write 1.0 instead of 1, or leave it out of `free`.")
         return np.zeros(np.size(leaf), bool)
     return np.broadcast_to(wanted, np.shape(leaf)).ravel()
+
+
+def _split_leaf(label: str, shape, values: np.ndarray, transform, fitted: np.ndarray, begin: int, copies: int):
+    """The parts of a leaf whose values, or as many copies of them, one for each record, begin at a place of all."""
+    parts, records = [], np.arange(copies)
+    for one, some in _split_by_transform(label, transform, fitted, shape):
+        if isinstance(one, AbstractTransform) and not (len(some) == values.size or one.separable):
+            raise ValueError(f"{label} is free as a whole or not at all: its transform is {one!r}.")
+        one = _specialize_transform(label, one, values[some], shape)
+        places = begin + some + values.size * records[:, None]
+        if copies == 1:
+            parts.append(Part(label, places[0], one, np.full(one.count_unknowns(len(some)), -1)))
+        elif one.separable:
+            parts.append(Part(label, places.ravel(), one, np.repeat(records, len(some))))
+        else:
+            each = one.count_unknowns(len(some))
+            parts += [Part(f"{label}[{k}]", own, one, np.full(each, k)) for k, own in enumerate(places)]
+    return parts
 
 
 def _split_by_transform(

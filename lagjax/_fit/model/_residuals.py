@@ -1,16 +1,17 @@
 """Residuals: the measured signals less those of the motions of a trial, with their derivatives.
 
 The unknowns are a `Point`: u (F,), the free parameters as their transforms move them, and the starts (N, 2n) of the N
-pieces of records. A residual of piece k depends on u and on start k alone: the rows of a piece, D = 2n + F columns and
-the residual, are compressed to a triangle of D + 1 rows (QR), in which all sums of squares are the same.
+pieces of records. A residual of piece k depends on start k and on L of the u alone, those that all records share and
+those of its own record (`Unknowns`): the rows of a piece, D = 2n + L columns and the residual, are compressed to a
+triangle of D + 1 rows (QR), in which all sums of squares are the same.
 
 **One system is a list of one.** Each system has its own coordinates, sensors and inputs; all share u. Once the start of
-a piece is eliminated only the columns of the parameters are left, and these are the same for all, so that the search
-does not know of systems. Rows of all systems are made alike: a start has room for the most coordinates, of which a
-smaller system leaves the last ones without any influence, like those of a start that is known; and the signals of all
-systems stand side by side, with no weight where a record does not have them.
+a piece is eliminated only the columns of the parameters are left, so that the search does not know of systems. Rows of
+all systems are made alike: a start has room for the most coordinates, of which a smaller system leaves the last ones
+without any influence, like those of a start that is known; and the signals of all systems stand side by side, with no
+weight where a record does not have them.
 
-`Residuals.evaluate` is the map for searches, and `SystemResiduals.trace_residuals` the same for JAX, from which
+`Residuals.evaluate` is the map for searches, and `Residuals.trace` the same for JAX, from which
 densities have their gradients: back over the steps of motions, where trials go forward along every unknown.
 """
 
@@ -26,10 +27,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import log_ndtr
 
-from lagjax._fit.model._inputs import Driven, constant_tables, input_functions, inputs_at
+from lagjax._fit.model._inputs import constant_tables, input_functions, inputs_at
 from lagjax._fit.model._motions import AbstractMotions, Manifold, Origins, RecordMotion
 from lagjax._fit.model._noise import AbstractNoise, NoiseScale, Sensor, counts, log_likelihood, scores, worths
-from lagjax._fit.model._parameters import Parameters
+from lagjax._fit.model._parameters import Parameters, Unknowns
 from lagjax._fit.model._pieces import Piece, Samples, batch_pieces, whole_pieces
 from lagjax._fit.model._records import start_pair
 from lagjax._fit.model._sensors import wrap_residuals
@@ -38,7 +39,7 @@ from lagjax._fit.model._timings import Clock
 from lagjax._interface import Layout, halves
 from lagjax._run import simulate
 from lagjax._run.hybrid import Scene
-from lagjax._scene import System
+from lagjax._scene import Driven, System
 
 
 class Point(NamedTuple):
@@ -75,8 +76,8 @@ class LostMotion(ValueError):
 
 
 class _SystemTrial(NamedTuple):
-    """The unknowns of one system in a trial: its parameters (P,) and their directions (F, P), its starts, how these
-    move with the unknown states, (N, 2n, 2n) or None for the identity, and with u, (N, F, 2n)."""
+    """The unknowns of one system in a trial: the parameters (N, P) of its pieces and their directions (N, L, P), the
+    starts, how these move with the unknown states, (N, 2n, 2n) or None for the identity, and with u, (N, L, 2n)."""
 
     numbers: np.ndarray
     directions: np.ndarray
@@ -104,7 +105,8 @@ class SystemResiduals:
     """The residuals of pieces of the records of one system, called `name`, None where there is no other.
 
     `fitted` (N,) says of each piece whether its start is free; `size` (S,) is the root mean square of the signals, and
-    that times `rtol`, the tolerance of the motion, the smallest noise that can be estimated. Where some pieces are
+    that times `rtol`, the tolerance of the motion, the smallest noise that can be estimated; `restore` makes the
+    parameters of the scene from the numbers (P,) of a record. Where some pieces are
     `Timings`, with `clocks` by the number of the record, crossing times are one more signal, the last. Rows and columns
     are those of `frame`, once the system is a part of `Residuals`.
     """
@@ -116,7 +118,7 @@ class SystemResiduals:
     fitted: np.ndarray
     motions: AbstractMotions
     signals: Signals
-    parameters: Parameters
+    restore: Callable[[Any], Any]
     size: np.ndarray
     rtol: float
     clocks: dict[int, Clock]
@@ -132,18 +134,12 @@ class SystemResiduals:
         self.layout: Layout = self.signals.layout
         self.states = 2 * self.layout.size
         starts = [self.records[piece.record].start if piece.places[0] == 0 else None for piece in self.pieces]
-        self.origins = Origins(starts, self.layout, self.parameters)
+        self.origins = Origins(starts, self.layout, self.restore)
         self.fits_on_constraints = self.manifold is not None and bool(self.fitted.any())
 
-    def with_records(
-        self, records: list[Any], fitted: np.ndarray, parameters: Parameters | None = None,
-        manifold: Manifold | None = None,
-    ) -> "SystemResiduals":  # fmt: skip
+    def with_records(self, records: list[Any], fitted: np.ndarray, manifold: Manifold | None = None):
         """The residuals of other records of the system with the same signals, each in one piece."""
-        return replace(
-            self, records=records, pieces=whole_pieces(records), fitted=fitted, clocks={}, manifold=manifold,
-            parameters=self.parameters if parameters is None else parameters,
-        )  # fmt: skip
+        return replace(self, records=records, pieces=whole_pieces(records), fitted=fitted, clocks={}, manifold=manifold)
 
     def columns(self, record: int) -> slice:
         first, last = self.frame.first, self.frame.first + len(self.signals.names)
@@ -180,10 +176,11 @@ class SystemResiduals:
 
     # ---- the trials of a search ----
 
-    def append_residuals(self, trial: Trial) -> None:
-        """Append the residuals of this system to a trial, whose starts move to where the motions begin. Raises
-        `LostMotion` for the first piece whose motion fails."""
-        begun = self._begin_trial(trial)
+    def append_residuals(self, trial: Trial, numbers: np.ndarray, directions: np.ndarray) -> None:
+        """Append the residuals of this system to a trial, whose starts move to where the motions begin, for parameters
+        `numbers` (N, P) of the pieces with `directions` (N, L, P). Raises `LostMotion` for the first piece whose motion
+        fails."""
+        begun = self._begin_trial(trial, numbers, directions)
         for batch in self.batches:
             clock = self.clocks.get(self.pieces[batch.rows[0]].record)
             if clock is not None:
@@ -192,7 +189,7 @@ class SystemResiduals:
                 shown = self._evaluate_delayed(batch, begun)
             else:
                 motion, numbers_dot = self._follow(batch, batch.ts, begun), self._directions(batch, begun)[1]
-                shown = self.signals.evaluate(motion, batch.ts, batch.inputs, begun.numbers, numbers_dot)
+                shown = self.signals.evaluate(motion, batch.ts, batch.inputs, begun.numbers[batch.rows], numbers_dot)
             self._require_finite(batch, *shown)
             self._append_batch(batch, trial, *shown)
 
@@ -205,65 +202,69 @@ class SystemResiduals:
         begin = self.records[record].ts[places[0]]
         return LostMotion(f"The motion of {self.label(record)} from t = {begin:g} failed. {text}")
 
-    def _begin_trial(self, trial: Trial) -> _SystemTrial:
+    def _begin_trial(self, trial: Trial, numbers: np.ndarray, directions: np.ndarray) -> _SystemTrial:
         rows, states = self.frame.rows, self.states
-        numbers, directions = self.parameters.numbers(trial.u), self.parameters.directions(trial.u)
         starts, starts_dot = self.origins.move(trial.starts[rows, :states], numbers, directions)
         tangents = None
         if self.fits_on_constraints:
             assert self.manifold is not None and trial.across is not None
             some, tangents = self.fitted, np.tile(np.eye(states), (len(starts), 1, 1))
             t = np.array([self.records[piece.record].ts[piece.places[0]] for piece in self.pieces])
-            consistent = self.manifold.project(starts[some], t[some], numbers, directions)
+            consistent = self.manifold.project(starts[some], t[some], numbers[some], directions[some])
             starts[some], tangents[some], starts_dot[some] = consistent
             if (lost := ~np.isfinite(starts).all(axis=1)).any():
                 raise self.lost(np.argmax(lost), "No start near the one that was tried satisfies the constraints.")
             trial.across[rows, :states, :states] = np.eye(states) - tangents
-        if not (np.isfinite(numbers).all() and np.isfinite(directions).all() and np.isfinite(starts).all()):
-            raise self.lost(0, "A parameter is not finite.")
+        finite = [np.isfinite(x).reshape(len(starts), -1).all(axis=1) for x in (numbers, directions, starts)]
+        if not np.all(finite):
+            raise self.lost(np.argmin(np.all(finite, axis=0)), "A parameter is not finite.")
         trial.starts[rows, :states] = starts
         return _SystemTrial(numbers, directions, starts, tangents, starts_dot)
 
     def _follow(self, batch: Samples, ts: np.ndarray, trial: _SystemTrial) -> RecordMotion:
         """The motions of a trial at the times `ts` (N, T) of the pieces of a batch."""
         y0_dot, numbers_dot = self._directions(batch, trial)
-        motion = self.motions.follow(ts, trial.starts[batch.rows], trial.numbers, y0_dot, numbers_dot, batch.table)
+        rows = batch.rows
+        motion = self.motions.follow(ts, trial.starts[rows], trial.numbers[rows], y0_dot, numbers_dot, batch.table)
         if not motion.ok:
             row, text = motion.describe_failure(ts, self.layout)
             raise self.lost(batch.rows[row], text)
         return motion
 
     def _directions(self, batch: Samples, trial: _SystemTrial) -> tuple[np.ndarray, np.ndarray]:
-        """Directions of the starts (N, D, 2n) and of the parameters (D, P): D = 2n + F, or F where no start is free."""
-        directions, states = trial.directions, self.states if self.fitted[batch.rows].any() else 0
-        y0_dot = np.zeros((len(batch.rows), states + len(directions), self.states))
+        """Directions of the starts (N, D, 2n) and of the parameters (N, D, P): D = 2n + L, or L where no start is
+        free."""
+        directions, states = trial.directions[batch.rows], self.states if self.fitted[batch.rows].any() else 0
+        y0_dot = np.zeros((len(batch.rows), states + directions.shape[1], self.states))
         y0_dot[:, :states] = np.eye(states, self.states)
         if trial.tangents is not None and states:
             y0_dot[:, :states] = trial.tangents[batch.rows].swapaxes(1, 2)
         y0_dot[:, states:] = trial.starts_dot[batch.rows]
-        return y0_dot, np.concatenate([np.zeros((states, directions.shape[1])), directions])
+        return y0_dot, np.pad(directions, ((0, 0), (states, 0), (0, 0)))
 
     def _evaluate_delayed(self, batch: Samples, trial: _SystemTrial) -> tuple[np.ndarray, np.ndarray]:
         """The signals of one trial, of each delay those that have it at earlier times, and their tangents."""
-        delays, signals, numbers = self.signals.delays, self.signals, trial.numbers
+        delays, signals, numbers = self.signals.delays, self.signals, trial.numbers[batch.rows]
         assert delays is not None
         numbers_dot = self._directions(batch, trial)[1]
         values = np.zeros((*batch.ts.shape, len(signals.names)))
-        slopes = np.zeros((*values.shape, len(numbers_dot)))
+        slopes = np.zeros((*values.shape, numbers_dot.shape[1]))
         for delay in delays.evaluate(numbers):
-            if not 0.0 <= delay.value <= delays.longest:
-                text = f"A delay is {delay.value:.4g}, but must lie between 0 and the longest one, {delays.longest:g}."
-                raise self.lost(batch.rows[0], text)
-            ts = np.maximum(batch.ts - delay.value, batch.ts[:, :1])
+            if (bad := ~((delay.values >= 0.0) & (delay.values <= delays.longest))).any():
+                text = "A delay is {:.4g}, but must lie between 0 and the longest one, {:g}."
+                row = int(np.argmax(bad))
+                raise self.lost(batch.rows[row], text.format(delay.values[row], delays.longest))
+            ts = np.maximum(batch.ts - delay.values[:, None], batch.ts[:, :1])
             motion = self._follow(batch, ts, trial)
             inputs, rates = batch.inputs, np.zeros_like(batch.inputs)
             if batch.table is not None and signals.form is not None:
                 inputs, rates = map(np.asarray, inputs_at(batch.table, ts, signals.form.hold))
-            ts_dot = -numbers_dot @ delay.slopes
+            ts_dot = -np.matmul(numbers_dot, delay.slopes[..., None])[..., 0]
             y, n = motion.path.reshape(-1, self.states), self.layout.size
-            pulled = self.motions.rate(ts.ravel(), y, numbers, constant_tables(ts.ravel(), inputs.reshape(len(y), -1)))
+            tables = constant_tables(ts.ravel(), inputs.reshape(len(y), -1))
+            pulled = self.motions.rate(ts.ravel(), y, np.repeat(numbers, ts.shape[1], axis=0), tables)
             rate = np.concatenate([y[:, n:], pulled], axis=1).reshape(motion.path.shape)
-            motion = motion._replace(tangents=motion.tangents + ts_dot[:, None, None] * rate[:, None])
+            motion = motion._replace(tangents=motion.tangents + ts_dot[:, :, None, None] * rate[:, None])
             some = signals.evaluate(motion, ts, inputs, numbers, numbers_dot, ts_dot, rates)
             values[..., delay.signals], slopes[..., delay.signals, :] = (x[:, :, delay.signals] for x in some)
         return values, slopes
@@ -282,9 +283,9 @@ class SystemResiduals:
 
     def _evaluate_times(self, clock: Clock, batch: Samples, trial: _SystemTrial):
         """The crossing times (1, M, 1) of a batch of one, and how they move (1, M, 1, D)."""
-        y0, numbers = trial.starts[batch.rows[0]], trial.numbers
+        y0, numbers = trial.starts[batch.rows[0]], trial.numbers[batch.rows[0]]
         y0_dot, numbers_dot = self._directions(batch, trial)
-        times, slopes = map(np.asarray, clock.tangents(y0, numbers, y0_dot[0], numbers_dot))
+        times, slopes = map(np.asarray, clock.tangents(y0, numbers, y0_dot[0], numbers_dot[0]))
         if not np.isfinite(times).all():
             raise self.lost(batch.rows[0], clock.describe_failure(y0, numbers))
         if not np.isfinite(slopes).all():
@@ -293,8 +294,8 @@ class SystemResiduals:
 
     def _append_batch(self, batch: Samples, trial: Trial, values: np.ndarray, by_unknowns: np.ndarray) -> None:
         counted, columns = batch.weights > 0, self.columns(self.pieces[batch.rows[0]].record)
-        free = len(self.parameters)
-        states = by_unknowns.shape[-1] - free  # none where no start is free
+        states = self.states if self.fitted[batch.rows].any() else 0
+        free = by_unknowns.shape[-1] - states
         shown, slopes = np.zeros(counted.shape), np.zeros((*counted.shape, self.frame.states + free))
         shown[..., columns], slopes[..., columns, self.frame.states :] = values, by_unknowns[..., states:]
         fitted = self.fitted[batch.rows, None, None, None]
@@ -304,37 +305,38 @@ class SystemResiduals:
 
     # ---- the same for JAX ----
 
-    def trace_residuals(self, batch: Samples, u, starts):
-        """The residuals of one batch, (N, T, S), at u (F,) and the starts (N, 2n) of its pieces; NaN where lost."""
-        layout, signals = self.layout, self.signals
-        numbers = self.parameters.numbers(u, jnp)
-        params = self.parameters.restore(numbers)
+    def trace_residuals(self, batch: Samples, numbers, starts):
+        """The residuals of one batch, (N, T, S), with the parameters (N, P) and the starts (N, 2n) of its pieces; NaN
+        where lost."""
+        layout, signals, kind = self.layout, self.signals, numbers.dtype
         record = self.pieces[batch.rows[0]].record
         form = signals.form if signals.form is not None and input_functions(self.scene) else None
         scene = form.drive_scene(self.scene) if form is not None and isinstance(self.scene, System) else self.scene
 
-        def sense(ts, y0, inputs, table):
+        def sense(ts, y0, numbers, inputs, table):
             q, qdot = map(layout.restore, halves(y0))
-            own = params if form is None else Driven(params, *table)
+            params = self.restore(numbers)
+            own = params if form is None else Driven(params, table)
             motion = simulate(scene, q, qdot, ts, own, rtol=self.rtol, throw=False)
             rows = jax.vmap(lambda q, v: jnp.concatenate([layout.flatten(q), layout.flatten(v)]))(motion.q, motion.qdot)
             return jax.vmap(lambda y, t, i: signals.evaluate_state(y, t, numbers, i))(rows, ts, inputs)
 
-        ts, values, inputs = (jnp.asarray(x, u.dtype) for x in (batch.ts, batch.values, batch.inputs))
-        table = None if batch.table is None else tuple(jnp.asarray(x, u.dtype) for x in batch.table)
+        ts, values, inputs = (jnp.asarray(x, kind) for x in (batch.ts, batch.values, batch.inputs))
+        table = jax.tree.map(lambda x: jnp.asarray(x, kind), batch.table)
         if record in self.clocks:
-            shown = self.clocks[record].times(starts[0], numbers)[None, :, None]
+            shown = self.clocks[record].times(starts[0], numbers[0])[None, :, None]
         else:
-            shown = jax.vmap(sense)(ts, starts, inputs, table)
+            shown = jax.vmap(sense)(ts, starts, numbers, inputs, table)
         shown = jnp.zeros(values.shape, values.dtype).at[..., self.columns(record)].set(shown)
         return jnp.where(batch.weights > 0, wrap_residuals(shown - values, self.frame.periods, jnp), 0.0)
 
-    def trace_starts(self, starts, params):
-        """The starts (M, 2n) of all systems for JAX, of which some of this one are functions of the parameters."""
-        for row, piece in zip(self.frame.rows, self.pieces, strict=True):
+    def trace_starts(self, starts, numbers):
+        """The starts (M, 2n) of all systems for JAX, of which some of this one are functions of the parameters (N, P)
+        of its pieces."""
+        for row, piece, own in zip(self.frame.rows, self.pieces, numbers, strict=True):
             start = self.records[piece.record].start
             if callable(start) and piece.places[0] == 0:
-                flat = jnp.concatenate([self.layout.flatten(half) for half in start_pair(start, params)])
+                flat = jnp.concatenate([self.layout.flatten(half) for half in start_pair(start, self.restore(own))])
                 starts = starts.at[row, : self.states].set(flat)
         return starts
 
@@ -345,7 +347,8 @@ class Residuals:
     - `systems`: the residuals of whole records of each. A piece has the number of its record among all, those of the
       first system first. Without `pieces` (N,) and `fitted` (N,), whether the start of a piece is free, the pieces are
       whole records.
-    - `parts`: the systems that have pieces. `records`; `states`: the numbers of a start.
+    - `parts`: the systems that have pieces. `records`; `states`: the numbers of a start. `unknowns`: those of the N
+      pieces.
     - `names`, `size`, `least` (S,): signals, their root mean square, and the smallest noise that can be estimated.
     - `batches`: the samples, with a column for every signal; `weights` (M, S): all of theirs; `measured`: how many.
     - `watch` is called with every trial of `evaluate`.
@@ -354,11 +357,12 @@ class Residuals:
     def __init__(
         self,
         systems: Sequence[SystemResiduals],
+        parameters: Parameters,
         pieces: list[Piece] | None = None,
         fitted: np.ndarray | None = None,
         watch: Callable[[Trial | LostMotion], None] | None = None,
     ):
-        self.systems, self.watch, self.parameters = list(systems), watch, systems[0].parameters
+        self.systems, self.watch, self.parameters = list(systems), watch, parameters
         self.records = [record for system in systems for record in system.records]
         firsts = np.cumsum([0, *(len(system.records) for system in systems)]).tolist()
         self._records = [slice(*ends) for ends in itertools.pairwise(firsts)]
@@ -399,15 +403,17 @@ class Residuals:
 
     def with_pieces(self, pieces: list[Piece], fitted: np.ndarray) -> "Residuals":
         """The residuals of other pieces of the records; the signals are those of systems with a piece."""
-        return Residuals(self.systems, pieces, fitted, self.watch)
+        return Residuals(self.systems, self.parameters, pieces, fitted, self.watch)
 
     def with_parameters(self, parameters: Parameters) -> "Residuals":
         other = copy.copy(self)
         other.parameters = parameters
-        other.systems, other.parts = ([copy.copy(one) for one in some] for some in (self.systems, self.parts))
-        for one in (*other.systems, *other.parts):
-            one.parameters = parameters
+        other.__dict__.pop("unknowns", None)
         return other
+
+    @functools.cached_property
+    def unknowns(self) -> Unknowns:
+        return self.parameters.unknowns.select([piece.record for piece in self.pieces])
 
     # ---- trials ----
 
@@ -416,15 +422,38 @@ class Residuals:
         constrained, square = any(part.fits_on_constraints for part in self.parts), (self.states, self.states)
         across = np.zeros((len(point.starts), *square)) if constrained else None
         trial = Trial(point.u, point.starts.copy(), [], [], across)
-        watch = self.watch or (lambda _: None)
+        numbers, directions = self.parameters.numbers(point.u), self.parameters.directions(point.u)
+        watch, owners = self.watch or (lambda _: None), np.array([piece.record for piece in self.pieces])
         try:
             for part in self.parts:
-                part.append_residuals(trial)
+                own = owners[part.frame.rows]
+                part.append_residuals(trial, numbers[self.parameters.places[own]], directions[own])
         except LostMotion as reason:
             watch(reason)
             raise
         watch(trial)
         return trial
+
+    def trace_starts(self, starts, u):
+        """The starts (N, 2n) for JAX, where those that are functions of the parameters follow u (F,)."""
+        numbers = self._trace_numbers(u)
+        for part in self.parts:
+            starts = part.trace_starts(starts, numbers[part.frame.rows])
+        return starts
+
+    def trace(self, u, starts) -> list:
+        """The residuals (N, T, S) of every batch for JAX, at u (F,) and the starts (N, 2n) of all pieces."""
+        numbers, found = self._trace_numbers(u), []
+        for part in self.parts:
+            for batch in part.batches:
+                rows = part.frame.rows[batch.rows]
+                found.append(part.trace_residuals(batch, numbers[rows], starts[rows, : part.states]))
+        return found
+
+    def _trace_numbers(self, u):
+        """The parameters (N, P) of the pieces at u (F,) for JAX."""
+        places = self.parameters.places[[piece.record for piece in self.pieces]]
+        return self.parameters.numbers(u, jnp)[places]
 
     def noise_scale(self, point: Trial, noise: AbstractNoise) -> NoiseScale:
         return noise.estimate(point.flat(), self.weights, self.least, self.sides)
@@ -512,7 +541,8 @@ class Residuals:
     # ---- pieces, records and systems ----
 
     @property
-    def unknowns(self) -> int:
+    def free_states(self) -> int:
+        """The numbers of all starts that are fitted."""
         return sum(part.states * int(part.fitted.sum()) for part in self.parts)
 
     def columns(self, record: int) -> slice:

@@ -31,10 +31,11 @@ PyTree = Any
 
 
 class Delay(NamedTuple):
-    """One of the delays: the `signals` that have it, its value, and its derivatives by all parameters (P,)."""
+    """One of the delays: the `signals` that have it, its `values` (N,), and their derivatives by the parameters (N, P)
+    of N pieces."""
 
     signals: np.ndarray
-    value: float
+    values: np.ndarray
     slopes: np.ndarray
 
 
@@ -56,16 +57,18 @@ class Delays:
                 raise ValueError("delay must return numbers, one for all signals or one for each leaf of values.")
             return jnp.stack([jnp.asarray(one, numbers.dtype) for one in spread])
 
-        self._value_and_jacobian = jax.jit(lambda numbers: (evaluate(numbers), jax.jacfwd(evaluate)(numbers)))
-        # Leaves that share one number share one motion.
-        jax.eval_shape(evaluate, jax.ShapeDtypeStruct(parameters.first.shape, parameters.first.dtype))
+        both = lambda numbers: (evaluate(numbers), jax.jacfwd(evaluate)(numbers))  # noqa: E731
+        self._value_and_jacobian = jax.jit(jax.vmap(both, out_axes=1))
+        jax.eval_shape(evaluate, parameters.example)
 
     def evaluate(self, numbers: np.ndarray) -> list[Delay]:
+        """The delays for the parameters (N, P) of pieces. Leaves that share one in all pieces share one motion."""
         values, slopes = (np.asarray(x, float) for x in self._value_and_jacobian(numbers))
-        rows, which = np.unique(np.column_stack([values, slopes]), axis=0, return_inverse=True)
-        which = which.ravel()
-        signals = [np.concatenate([self.places[i] for i in np.flatnonzero(which == k)]) for k in range(len(rows))]
-        return [Delay(own, float(row[0]), row[1:]) for own, row in zip(signals, rows, strict=True)]
+        rows = np.concatenate([values[..., None], slopes], axis=2)
+        _, first, which = np.unique(rows.reshape(len(rows), -1), axis=0, return_index=True, return_inverse=True)
+        groups = [np.flatnonzero(which.ravel() == k) for k in range(len(first))]
+        signals = [np.concatenate([self.places[i] for i in group]) for group in groups]
+        return [Delay(own, values[k], slopes[k]) for own, k in zip(signals, first, strict=True)]
 
 
 _AT_ONCE = 2048  # samples in one call of the compiled sensors: one program for records of any length
@@ -120,7 +123,7 @@ class Signals:
             return flat(*state), *jax.jacfwd(flat, argnums=(0, 2, 1, 3))(*state)
 
         self.evaluate_state = flat
-        self._value_and_jacobians = jax.jit(jax.vmap(value_and_jacobians, in_axes=(0, 0, 0, None)))
+        self._value_and_jacobians = jax.jit(jax.vmap(value_and_jacobians))
 
     def evaluate(
         self, motion: RecordMotion, ts: np.ndarray, inputs: np.ndarray, numbers: np.ndarray, numbers_dot: np.ndarray,
@@ -128,9 +131,9 @@ class Signals:
     ):  # fmt: skip
         """The signals (N, T, S) of motions, and their derivatives (N, T, S, D) along the directions of these.
 
-        `ts` (N, T) and `inputs` (N, T, I) are times and inputs there, `numbers` (P,) the parameters and `numbers_dot`
-        (D, P) their directions. Where the times move, too, by `ts_dot` (D,), the inputs have `rates` (N, T, I), and
-        `motion` moves with the times already.
+        `ts` (N, T) and `inputs` (N, T, I) are times and inputs there, `numbers` (N, P) the parameters and `numbers_dot`
+        (N, D, P) their directions. Where the times move, too, by `ts_dot` (N, D), the inputs have `rates` (N, T, I),
+        and `motion` moves with the times already.
         """
         tangents = motion.tangents
         if self._value_and_jacobians is None:
@@ -138,13 +141,15 @@ class Signals:
             return motion.path[..., :n], np.ascontiguousarray(np.moveaxis(tangents[..., :n], 1, -1))
         rows, times, states = motion.path.shape
         samples = motion.path.reshape(-1, states), ts.ravel(), inputs.reshape(rows * times, -1)
-        values, by_state, by_numbers, by_t, by_inputs = self._evaluate_portions(samples, numbers)
+        each = np.repeat(numbers, times, axis=0)
+        values, by_state, by_numbers, by_t, by_inputs = self._evaluate_portions(*samples, each)
         shape = rows, times, values.shape[1]
         slopes = np.matmul(by_state.reshape(*shape, states), np.moveaxis(tangents, 1, -1))
-        slopes += (by_numbers @ numbers_dot.T).reshape(*shape, len(numbers_dot))
+        moved = np.matmul(by_numbers.reshape(rows, times * shape[2], -1), numbers_dot.swapaxes(1, 2))
+        slopes += moved.reshape(slopes.shape)
         if ts_dot is not None and rates is not None:
             rate = by_t + np.einsum("msi,mi->ms", by_inputs, rates.reshape(len(by_t), -1))
-            slopes += rate.reshape(shape)[..., None] * ts_dot
+            slopes += rate.reshape(shape)[..., None] * ts_dot[:, None, None]
         return values.reshape(shape), slopes
 
     def look_like_positions(self, record: Record) -> bool:
@@ -170,8 +175,9 @@ class Signals:
     def _newton(self, shown: np.ndarray, instants: tuple, numbers: np.ndarray, periods: np.ndarray):
         """q (M, n) for which sensors show `shown` (M, n), up to whole periods; None where the steps do not end."""
         q, rest, n = shown.copy(), np.zeros_like(shown), self.layout.size
+        each = np.broadcast_to(numbers, (len(q), len(numbers)))
         for _ in range(_NEWTON):
-            values, by_state, *_ = self._evaluate_portions((np.concatenate([q, rest], axis=1), *instants), numbers)
+            values, by_state, *_ = self._evaluate_portions(np.concatenate([q, rest], axis=1), *instants, each)
             left, slope = wrap_residuals(values - shown, periods), by_state[..., :n]
             if not (np.isfinite(left).all() and (np.linalg.cond(slope) < _SINGULAR).all()):
                 return None
@@ -181,20 +187,19 @@ class Signals:
                 return q
         return None
 
-    def _evaluate_portions(self, samples, numbers):
+    def _evaluate_portions(self, *samples):
         assert self._value_and_jacobians is not None
         parts = []
         for begin in range(0, len(samples[0]), _AT_ONCE):
             some = [x[begin : begin + _AT_ONCE] for x in samples]
-            filled = [np.resize(x, (_AT_ONCE, *x.shape[1:])) for x in some]
-            arrays = (np.asarray(x, self.layout.dtype) for x in (*filled, numbers))
+            arrays = (np.resize(x, (_AT_ONCE, *x.shape[1:])).astype(self.layout.dtype) for x in some)
             parts.append([np.asarray(x, float)[: len(some[0])] for x in self._value_and_jacobians(*arrays)])
         return [np.concatenate(columns) for columns in zip(*parts, strict=True)]
 
 
 def _require_signals(observe_state, layout: Layout, parameters: Parameters, record: Record, inputs: int) -> None:
     """Raise `ValueError` where `observe` does not return what the records hold."""
-    shapes = (2 * layout.size,), (), parameters.first.shape, (inputs,)
+    shapes = (2 * layout.size,), (), parameters.example.shape, (inputs,)
     out = jax.eval_shape(observe_state, *(jax.ShapeDtypeStruct(shape, layout.dtype) for shape in shapes))
     leaves, tree = jax.tree.flatten(out)
     got = tree, tuple(getattr(leaf, "shape", ()) for leaf in leaves)

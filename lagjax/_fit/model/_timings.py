@@ -269,7 +269,7 @@ def _transitions_in(scene: Hybrid, layout: Layout, parameters: Parameters, timin
 def _impacts_in(system: System, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> tuple:
     """A contact is struck where it gives an impulse. Raises `ValueError` for a name that no contact has."""
     flat, (_, struck) = timings.flat, _sections(timings.section)
-    names = system.contact_names(layout, parameters.restore(parameters.first))
+    names = system.contact_names(layout, parameters.restore(parameters.example))
     short = list(map(_shorten, names))
     for name in struck:
         if name not in (*short, *names):
@@ -300,7 +300,7 @@ def _crossings_in(system: System, layout: Layout, parameters: Parameters, timing
 
     advice = ""
     if system.touches:
-        name = _shorten(system.contact_names(layout, parameters.restore(parameters.first))[0])
+        name = _shorten(system.contact_names(layout, parameters.restore(parameters.example))[0])
         advice = f" An impact that closes a gap is no crossing: Timings({name!r}, times, …) are those of a contact."
     return instants, lambda m: "crossings" + ("" if keys is None else f" of section[{keys[flat.which[m]]!r}]"), advice
 

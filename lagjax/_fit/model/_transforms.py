@@ -59,6 +59,11 @@ class AbstractTransform(abc.ABC):
         """∂x/∂u, (n, m)."""
         return np.asarray(_compile_jacobian(self)(u))
 
+    def slopes(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The entries of ∂x/∂u that are not zero by construction: rows, columns, and values."""
+        matrix = self.jacobian(u)
+        return *(places.ravel() for places in np.indices(matrix.shape)), matrix.ravel()
+
     @abc.abstractmethod
     def inverse(self, x: np.ndarray) -> np.ndarray:
         """u(x) of values inside the set, (n,) → (m,)."""
@@ -100,6 +105,9 @@ class AbstractSeparable(AbstractTransform):
 
     def jacobian(self, u):
         return np.diag(self.slope(u))
+
+    def slopes(self, u):
+        return np.arange(len(u)), np.arange(len(u)), self.slope(u)
 
     def ends(self, x, spread):
         """x(u ± spread / slope): relative for logarithms, and inside of the bounds. Where x ± spread does not exclude a

@@ -109,8 +109,9 @@ def _cross_validate(fit, folds: int) -> tuple[dict[str, float], np.ndarray]:
             done = minimise(rest, begin, fit.law, _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
             known |= zip(rest.names, zip(*done.noise, strict=True), strict=True)
             law = KnownNoise(NoiseScale(*np.array([known[name] for name in apart.names]).T))
-            apart = apart.with_parameters(residuals.parameters.fix(done.trial.u))
-            end = minimise(apart, left_out, law, _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
+            kept = np.isin(np.arange(len(fit.u)), residuals.unknowns.shared)
+            apart = apart.with_parameters(residuals.parameters.fix(done.trial.u, kept))
+            end = minimise(apart, left_out._replace(u=done.trial.u[~kept]), law, _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
         except LostMotion:
             return dict.fromkeys(residuals.names, np.inf), np.full(folds, np.inf)
         square, weight = (apart.weights * end.trial.flat() ** 2).sum(axis=0), apart.weights.sum(axis=0)

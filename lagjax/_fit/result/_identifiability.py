@@ -41,9 +41,20 @@ def unseen_sentences(descent: Descent, known: Information) -> tuple[str, ...]:
     with contextlib.suppress(LostMotion):
         other = residuals.evaluate(Point(near, trial.starts))
         factors = [np.sqrt(batch.weights) / descent.noise.sigma for batch in residuals.batches]
-        there = confirmed_null(residuals, other, null_space(residuals.triangles(other, factors), residuals.states)[0])
+        triangles = residuals.triangles(other, factors)
+        there = confirmed_null(residuals, other, null_space(triangles, residuals.states, residuals.unknowns)[0])
         spaces.append((parameters.jacobian(near) @ there, parameters.values(near)))
-    found = [_sentence(parameters, block, spaces) for block in _blocks(spaces[0][0])]
+    blocks, elements = _blocks(spaces[0][0]), np.array(parameters.elements)
+    alone = [int(block[0]) for block in blocks if len(block) == 1]
+    nowhere = {name for name in elements[alone] if np.isin(np.flatnonzero(elements == name), alone).all()}
+    nowhere -= {*parameters.names}  # those that all share
+    found = [
+        f"Nothing that was measured in any record depends on {elements[block[0]]}."
+        if len(block) == 1 and elements[block[0]] in nowhere
+        else _sentence(parameters, block, spaces)
+        for block in blocks
+    ]
+    found = [*dict.fromkeys(found)]
     if not found:
         ended = dict.fromkeys(parameters.labels[i] for i in np.flatnonzero(np.abs(null).max(axis=1) > 1e-6))
         found = [f"At the end of its set, where nothing that was measured depends on it: {', '.join(ended)}."]
@@ -95,7 +106,7 @@ def sentence_on_rest(descent: Descent, known: Information, law: AbstractNoise) -
     gain = share * (residuals.log_likelihood(trial, descent.noise) - of_rest)
     driven = all(input_functions(part.scene) for part in residuals.parts)
     many = 1.0 if driven else max(len(record) for record in recordings) / 2
-    used = max(len(residuals.parameters) + residuals.unknowns - constants - (many > 1), 1)
+    used = max(len(residuals.parameters) + residuals.free_states - constants - (many > 1), 1)
     least = np.log(many) + 0.5 * float(chdtri(used, _CHANCE))
     if gain >= least:
         return ()

@@ -25,6 +25,7 @@ from scipy.special import stdtrit
 from lagjax._equations import decide
 from lagjax._fit.model._autocorrelation import autocorrelations, close_gaps, correlated_square
 from lagjax._fit.model._noise import harmonics, rounding_square
+from lagjax._fit.model._parameters import Unknowns
 from lagjax._fit.model._residuals import Residuals, Trial, compress_rows
 from lagjax._fit.search._descent import Descent
 
@@ -72,6 +73,13 @@ class Information(NamedTuple):
         """The covariance (F, F) of what is seen, zero along what is not; with white residuals where some is not."""
         return self.lost * self.white if self.null.size else self.covariance
 
+    def select(self, places: np.ndarray) -> "Information":
+        """The information about the unknowns at `places`, F for none, without what the others would do."""
+        pair = np.ix_(places, places)
+        covariance, white = (np.pad(x, (0, 1))[pair] for x in (self.covariance, self.white))
+        null, confirmed = (np.pad(x, ((0, 1), (0, 0)))[places] for x in (self.null, self.confirmed))
+        return self._replace(covariance=covariance, white=white, null=null, confirmed=confirmed)
+
     def quantile(self, level: float) -> float:
         """Student's t of a level, for the effective number of samples less that of parameters."""
         require_level(level)
@@ -87,39 +95,44 @@ def require_level(level) -> None:
 def information(descent: Descent) -> Information:
     residuals, trial, noise = descent.residuals, descent.trial, descent.noise
     factors = residuals.fisher_factors(trial, noise)
-    triangles = residuals.triangles(trial, factors)
-    null, basis = null_space(triangles, residuals.states)
+    triangles, unknowns = residuals.triangles(trial, factors), residuals.unknowns
+    null, basis = null_space(triangles, residuals.states, unknowns)
     # Growth alone is not enough: a drive that sets in smoothly begins with rows as small as numbers can be.
-    free, sizes, states = len(trial.u), residuals.parameters.sizes(trial.u), residuals.states
-    last = [np.abs(x[..., states:] * sizes / residuals.size[:, None]).max(initial=0.0) for x in trial.slopes]
+    free, states = len(trial.u), residuals.states
+    sizes = np.append(residuals.parameters.sizes(trial.u), 0.0)[unknowns.columns][:, None, None]
+    pairs = zip(residuals.batches, trial.slopes, strict=True)
+    last = [np.abs(x[..., states:] * sizes[b.rows] / residuals.size[:, None]).max(initial=0.0) for b, x in pairs]
     if max(last) > _LOST and growth(row_sizes(residuals, trial)) > _LOST:
         null, basis = np.eye(free), np.zeros((free, 0))
     laws = autocorrelations(residuals, trial, noise)
     effective, correlation = (np.array(x) for x in zip(*((a.count / a.time, a.neighbour) for a in laws), strict=True))
-    unit = _lengths(triangles, states)  # of columns: their squares may be no numbers
+    unit = _lengths(triangles, states, unknowns)  # of columns: their squares may be no numbers
+    unit_of = np.append(unit, 1.0)[unknowns.columns][:, None, None]
     middle, rows_of = np.zeros((free, free)), []
     for batch, factor, slopes in zip(residuals.batches, factors, trial.slopes, strict=True):
-        own = eliminate_starts(triangles[batch.rows], factor[..., None] * slopes, states) / unit
+        own, columns = factor[..., None] * slopes, unknowns.select(batch.rows)
+        own = eliminate_starts(triangles[batch.rows], own, states) / unit_of[batch.rows]
         rows_of.append(own)
         for s in np.flatnonzero(np.isnan(residuals.sensor.step)):
-            middle += correlated_square(close_gaps(own[:, :, s], batch.weights[..., s] > 0), laws[s].lags)
+            middle += columns.add(correlated_square(close_gaps(own[:, :, s], batch.weights[..., s] > 0), laws[s].lags))
     for s in np.flatnonzero(np.isfinite(residuals.sensor.step)).tolist():
         sigma, step = noise.sigma[s], residuals.sensor.step[s]
         _, rest, before = harmonics(step, sigma)
         rows = [np.sqrt(b.weights[..., s, None]) / sigma * own[:, :, s]
                 for b, own in zip(residuals.batches, rows_of, strict=True)]  # fmt: skip
         for g, b in zip(rows, residuals.batches, strict=True):
-            g = close_gaps(g, b.weights[..., s] > 0)
-            middle += before * correlated_square(g, laws[s].lags) + rest * correlated_square(g, np.ones(1))
+            g, columns = close_gaps(g, b.weights[..., s] > 0), unknowns.select(b.rows)
+            middle += columns.add(before * correlated_square(g, laws[s].lags) + rest * correlated_square(g, np.ones(1)))
+        rows = [unknowns.select(b.rows).spread(g) for b, g in zip(residuals.batches, rows, strict=True)]
         middle += rounding_square(rows, residuals.exact_values(trial, s), step, sigma)
         share = min(before / sigma**2, 1.0)
         worth = sum(float(w.sum()) for w in residuals.worths(trial, noise, s))
         effective[s], correlation[s] = worth / (1 + (laws[s].time - 1) * share), share * correlation[s]
     # Student's t tells (ν+1)/(ν+3) of what a Gaussian of the same σ tells; the dof that were used up are counted.
-    used = free - null.shape[1] + residuals.unknowns
+    used = free - null.shape[1] + residuals.free_states
     lost = max(effective.sum() / max(effective.sum() - used, 1.0), 1.0)
     robust = np.mean([1.0 if np.isinf(d) else (d + 3) / (d + 1) for d in noise.dof])
-    rows, basis = _parameter_rows(triangles, states) / unit, basis * unit[:, None]
+    rows, basis = _parameter_rows(triangles, states, unknowns) / unit, basis * unit[:, None]
     half = basis @ np.linalg.solve(basis.T @ (rows.T @ rows) @ basis, basis.T)
     white = robust * half / unit / unit[:, None]
     covariance = lost * robust * half @ middle @ half.T / unit / unit[:, None]
@@ -131,9 +144,9 @@ def information(descent: Descent) -> Information:
     return Information(covariance, null, confirmed, effective, correlation, white, float(lost))
 
 
-def null_space(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
+def null_space(triangles: np.ndarray, states: int, unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray]:
     """Directions of u (F, K) that nothing depends on, the starts being free; and a basis (F, F − K) of the others."""
-    rows, unit = _parameter_rows(triangles, states), _lengths(triangles, states)
+    rows, unit = _parameter_rows(triangles, states, unknowns), _lengths(triangles, states, unknowns)
     if not len(unit):
         return np.zeros((0, 0)), np.zeros((0, 0))
     # From above zero by its own round-off, so that a column which is noise alone counts as nothing.
@@ -149,7 +162,7 @@ def confirmed_null(residuals: Residuals, point: Trial, null: np.ndarray) -> np.n
         return null
     with np.errstate(divide="ignore"):
         level = [np.where(size > 0, 1.0 / size, 0.0) for size in sizes]
-    return null_space(residuals.triangles(point, level), residuals.states)[0]
+    return null_space(residuals.triangles(point, level), residuals.states, residuals.unknowns)[0]
 
 
 def row_sizes(residuals: Residuals, point: Trial) -> list[np.ndarray]:
@@ -168,15 +181,15 @@ def growth(sizes: list[np.ndarray]) -> float:
     return found
 
 
-def _parameter_rows(triangles: np.ndarray, states: int) -> np.ndarray:
-    """The rows of the parameters, orthogonal to those of the starts: a triangle with F columns."""
-    own = eliminate_starts(triangles, triangles[..., :-1], states)
+def _parameter_rows(triangles: np.ndarray, states: int, unknowns: Unknowns) -> np.ndarray:
+    """The rows of the unknowns, orthogonal to those of the starts: a triangle with F columns."""
+    own = unknowns.spread(eliminate_starts(triangles, triangles[..., :-1], states))
     return compress_rows(own.reshape(1, own.shape[0] * own.shape[1], own.shape[-1]))[0]
 
 
-def _lengths(triangles: np.ndarray, states: int) -> np.ndarray:
-    """The length of the column of each parameter (F,), one for a column of nothing."""
-    length = _norm(triangles[..., states:-1], (0, 1))
+def _lengths(triangles: np.ndarray, states: int, unknowns: Unknowns) -> np.ndarray:
+    """The length of the column of each unknown (F,), one for a column of nothing."""
+    length = unknowns.norms(_norm(triangles[..., states:-1], 1))
     return np.where(length > _NOTHING, length, 1.0)
 
 
@@ -195,15 +208,13 @@ def eliminate_starts(triangles: np.ndarray, slopes: np.ndarray, states: int) -> 
     return slopes[..., states:] - np.matmul(slopes[..., :states], instead.reshape(shape))
 
 
-def covariance_of_one_start(
-    rows: np.ndarray, states: int, known: Information, share: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """The covariance (2n, 2n) of a start for fixed parameters, and A⁺B, from weighted rows (T, S, 2n + F) of which each
-    sample is worth the `share` of an independent one."""
+def covariance_of_one_start(rows: np.ndarray, states: int, known: Information) -> tuple[np.ndarray, np.ndarray]:
+    """The covariance (K, K) of the first `states` columns for fixed others, and how they follow these, from weighted
+    rows (T, S, K + L) of samples that count for what they are worth."""
     flat = rows.reshape(-1, rows.shape[-1])
     decided = decide(flat[:, :states], _UNFELT)
     half = decided.right[:, : int(decided.rank)] / decided.values[: int(decided.rank)]
-    return known.lost / share * half @ half.T, decided.least_norm(flat[:, states:].T).T
+    return known.lost * half @ half.T, decided.least_norm(flat[:, states:].T).T
 
 
 def signal_deviations(slopes: np.ndarray, states: int, start: np.ndarray, follows: np.ndarray, known: Information):

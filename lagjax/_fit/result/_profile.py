@@ -86,7 +86,8 @@ class _ProfileLine:
                 return place.deviance
         u = self.u.copy()
         u[self.which] = at
-        residuals = self.residuals.with_parameters(self.residuals.parameters.fix(u, self.which))
+        kept = np.arange(len(u)) == self.which
+        residuals = self.residuals.with_parameters(self.residuals.parameters.fix(u, kept))
         nearest = min(self.places, key=lambda place: abs(place.at - at)).others
         with contextlib.suppress(LostMotion):
             self.places.append(_Place(at, *self._minimise(residuals, nearest, _TRIALS)))

@@ -121,20 +121,23 @@ def _describe_missed_limits(residuals: Residuals, trial: Trial) -> list[str]:
 
 
 def _describe_bends(descent: Descent, known: Information) -> list[str]:
-    """Sentences for numbers on one side of which the likelihood falls by less than half of what an interval says."""
+    """Sentences for numbers that all records share, where the likelihood falls on one side by less than half of what an
+    interval says."""
     residuals, trial, found = descent.residuals, descent.trial, []
     if known.null.shape[1] or not any(jumps(part.scene) for part in residuals.parts):
         return found
     parameters, best = residuals.parameters, residuals.log_likelihood(trial, descent.noise)
-    for k, (label, deviation) in enumerate(zip(parameters.labels, _deviations(known), strict=True)):
+    labels, deviations = parameters.labels, _deviations(known)
+    for k in residuals.unknowns.shared.tolist():
+        label, deviation = labels[k], deviations[k]
         kept = _KEPT / deviation * (np.arange(len(trial.u)) == k), np.zeros(len(trial.u))
         for side, word in ((-_ASIDE, "smaller"), (_ASIDE, "larger")):
             with contextlib.suppress(LostMotion):
                 there = residuals.evaluate(Point(trial.u + side * known.covariance[k] / deviation, trial.starts))
                 triangles = residuals.linearise(there, descent.noise)
-                scale = column_norms(triangles, residuals.states)
+                scale = column_norms(triangles, residuals.states, residuals.unknowns)
                 # What all others can still win there, to first order: behind the kink they turn back.
-                gain = eliminate(triangles, residuals.states, scale, 1e-14, kept).gain
+                gain = eliminate(triangles, residuals.states, scale, 1e-14, kept, residuals.unknowns).gain
                 if best - residuals.log_likelihood(there, descent.noise) - gain < _ASIDE**2 / 4:
                     found.append(
                         f"The data hardly exclude a {word} {label}: the motion sticks, or strikes, otherwise there, "
@@ -150,11 +153,12 @@ def _deviations(known: Information) -> np.ndarray:
 
 def _describe_ends(residuals: Residuals, trial: Trial, triangles: np.ndarray, known: Information):
     """Sentences for the numbers at the end of their sets, and for each unknown whether there is one (F,)."""
-    parameters, states = residuals.parameters, residuals.states
+    parameters, states, unknowns = residuals.parameters, residuals.states, residuals.unknowns
     found, named, none = [], np.zeros(len(parameters), bool), np.zeros(len(parameters))
     if known.null.shape[1] or not len(parameters):
         return found, named
-    step = eliminate(triangles, states, column_norms(triangles, states), 1e-14, (none, none)).u
+    scale = column_norms(triangles, states, unknowns)
+    step = eliminate(triangles, states, scale, 1e-14, (none, none), unknowns).u
     deviations = _deviations(known)
     for k, (label, transform) in enumerate(zip(parameters.labels, parameters.maps, strict=True)):
         if not isinstance(transform, Positive | Between):
@@ -188,15 +192,17 @@ def _disagreements(
     residuals: Residuals, triangles: np.ndarray, known: Information, inside: np.ndarray, motion: dict[int, float]
 ) -> tuple[list[str], list[str]]:
     """Sentences for records of another motion, and for those that show what the scene lacks, each differently. Only of
-    parameters `inside` (F,) of their sets; `motion` is the sum of squares left in a record beyond white noise."""
-    records = np.array([piece.record for piece in residuals.pieces])
-    count = len(np.unique(records))
-    if known.null.shape[1] or count < 2 or not inside.any():
+    parameters that all share, `inside` (F,) of their sets; `motion` is the sum of squares left in a record beyond white
+    noise."""
+    records, unknowns = np.array([piece.record for piece in residuals.pieces]), residuals.unknowns
+    count, shared = len(np.unique(records)), unknowns.shared[inside[unknowns.shared]]
+    if known.null.shape[1] or count < 2 or not len(shared):
         return [], []
-    columns = np.concatenate([np.ones(residuals.states, bool), inside, [True]])
-    variances = np.diag(known.covariance)[inside], np.diag(known.white)[inside]
-    shifts = shifts_without(residuals.states, triangles[..., columns], records, *variances)
-    labels = [label for label, keep in zip(residuals.parameters.labels, inside, strict=True) if keep]
+    own = residuals.states + unknowns.own  # numbers of a record are taken out as its start is
+    columns = np.concatenate([np.ones(own, bool), inside[unknowns.shared], [True]])
+    variances = np.diag(known.covariance)[shared], np.diag(known.white)[shared]
+    shifts = shifts_without(own, triangles[..., columns], records, *variances)
+    labels = [residuals.parameters.labels[k] for k in shared]
     worst = [(k, int(np.argmax(np.abs(shift.sizes)))) for k, shift in shifts.items()]
     worst = sorted((-abs(shifts[k].sizes[i]), k, i) for k, i in worst if abs(shifts[k].sizes[i]) > _DISAGREE)
     apart = [(k, i) for _, k, i in worst if shifts[k].explained > _OWN * motion.get(k, 0.0)]

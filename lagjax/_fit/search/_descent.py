@@ -2,9 +2,11 @@
 
 It is Gauss–Newton with Levenberg's and Marquardt's damping; starts are eliminated one by one. The damped
 step (δu, δs₁ … δs_N) minimises Σₖ |Aₖ δsₖ + Bₖ δu + rₖ|² + λ |scale · step|². One QR of the small triangle of piece k
-takes out δsₖ: its first 2n rows say what δsₖ follows from δu, the rest says what piece k wants of δu. Below each other
-these rests are a problem of F columns. That is the Schur complement of the normal equations without ever forming them,
-which would square the condition; the cost is linear in the number of pieces.
+takes out δsₖ: its first 2n rows say what δsₖ follows from δu, the rest says what piece k wants of δu. Of the unknowns
+that move numbers of one record alone the same is said by a QR of the rests of its pieces. What is left then, below each
+other, is a problem of the columns that all records share. That is the Schur complement of the normal equations, which
+are an arrow, without ever forming them, which would square the condition; the cost is linear in the number of pieces,
+and in that of records.
 
 Which library: none, for this step. `scipy.optimize.least_squares` (trf) factors one dense Jacobian of F + 2nN columns,
 which is cubic in the number of pieces, or takes inexact steps by LSMR on a sparse one: from the same start to the same
@@ -24,6 +26,7 @@ import numpy as np
 
 from lagjax._fit.model._autocorrelation import independent_share
 from lagjax._fit.model._noise import AbstractNoise, NoiseScale
+from lagjax._fit.model._parameters import Unknowns
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals, Trial, compress_rows, qr_triangle
 
 # Damping, relative to the squared norms of the columns. The first step is nearly that of Gauss and Newton; below the
@@ -83,9 +86,10 @@ class _Model:
         return self.residuals.cost(trial, self.factors, self.noise) + pulled
 
     def step(self, damping: float) -> DescentStep:
-        u, states = self.trial.u, self.residuals.states
+        u, states, unknowns = self.trial.u, self.residuals.states, self.residuals.unknowns
         pull, limits = (self.anchor.weight, self.anchor.pull(u)), self.residuals.parameters.limits(u)
-        return eliminate(self.triangles, states, column_norms(self.triangles, states), damping, pull, limits)
+        scale = column_norms(self.triangles, states, unknowns)
+        return eliminate(self.triangles, states, scale, damping, pull, unknowns, limits)
 
     def is_enough(self, gain: float, enough: float) -> bool:
         """True if half the sum of squares is at most `enough`, correlated residuals counted for what they are worth."""
@@ -144,39 +148,71 @@ def _find_better_trial(model: _Model, damping: float, trials: int, limit: int) -
     return None, damping, trials
 
 
-def eliminate(triangles: np.ndarray, states: int, scale, damping: float, pull, limits=(-np.inf, np.inf)) -> DescentStep:
-    """The damped step for triangles (N, D + 1, D + 1) whose first `states` columns are starts. `scale` holds column
-    norms, `pull` the (weight, residuals) of an anchor; steps beyond `limits` (low, high) are damped more."""
+def eliminate(
+    triangles: np.ndarray, states: int, scale, damping: float, pull, unknowns: Unknowns, limits=(-np.inf, np.inf)
+) -> DescentStep:
+    """The damped step for triangles (N, D + 1, D + 1) whose first `states` columns are starts, and the others but the
+    last those of `unknowns`. `scale` holds column norms, `pull` the (weight, residuals) of an anchor; steps beyond
+    `limits` (low, high) are damped more."""
     of_starts, of_u = scale
-    (pieces, columns, _), free = triangles.shape, len(of_u)
+    pieces, columns, _ = triangles.shape
     damped = np.zeros((pieces, states, columns))
     damped[:, np.arange(states), np.arange(states)] = np.sqrt(damping) * of_starts
     r = qr_triangle(np.concatenate([triangles, damped], axis=1))
-    anchored = np.concatenate([np.diag(pull[0]), pull[1][:, None]], axis=1)
-    rest = compress_rows(np.concatenate([r[:, states:, states:].reshape(-1, free + 1), anchored])[None])[0]
-    du = _limited_step(rest, of_u, damping, limits)
-    right = r[:, :states, -1] + r[:, :states, states:-1] @ du
+    du = _limited_step(r[:, states:, states:], of_u, damping, pull, unknowns, limits)
+    local = np.append(du, 0.0)[unknowns.columns]
+    right = r[:, :states, -1] + np.matmul(r[:, :states, states:-1], local[..., None])[..., 0]
     ds = np.linalg.solve(r[:, :states, :states], -right[..., None])[..., 0]
-    whole = np.concatenate([ds, np.broadcast_to(du, (pieces, free)), np.ones((pieces, 1))], axis=1)
+    whole = np.concatenate([ds, local, np.ones((pieces, 1))], axis=1)
     after = np.sum((triangles @ whole[..., None]) ** 2)
     gain = np.sum(triangles[..., -1] ** 2) - after + np.sum(pull[1] ** 2) - np.sum((pull[1] + pull[0] * du) ** 2)
     return DescentStep(du, ds, float(0.5 * gain))
 
 
-def _limited_step(rest: np.ndarray, of_u: np.ndarray, damping: float, limits) -> np.ndarray:
-    """δu (F,) that minimises |rest (δu, 1)|² + Σ damping (scale δu)², with more damping of what is beyond limits."""
-    free, each = len(of_u), np.full(len(of_u), damping)
+def _limited_step(rows: np.ndarray, of_u: np.ndarray, damping: float, pull, unknowns: Unknowns, limits) -> np.ndarray:
+    """δu (F,) that minimises |rows (δu, 1)|² + |pull|² + Σ damping (scale δu)², over rows (N, M, L + 1) of pieces, with
+    more damping of what is beyond limits."""
+    rows, each = unknowns.stack_by_owner(rows), np.full(len(of_u), damping)
+    rows = rows if unknowns.own else compress_rows(rows.reshape(1, -1, rows.shape[-1]))
     while True:
-        triangle = qr_triangle(np.concatenate([rest, np.diag(np.append(np.sqrt(each) * of_u, 0.0))[:free]]))
-        du = np.linalg.solve(triangle[:free, :free], -triangle[:free, free])
+        du = _damped_step(rows, np.sqrt(each) * of_u, pull, unknowns)
         beyond = (du < limits[0]) | (du > limits[1])
         if not beyond.any() or each[beyond].min() > _MOST_DAMPING:
             return du
         each[beyond] *= 10.0
 
 
-def column_norms(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
-    """The norms of the columns of starts (N, 2n) and of parameters (F,); one where nothing depends on a column."""
+def _damped_step(rows: np.ndarray, damping: np.ndarray, pull, unknowns: Unknowns) -> np.ndarray:
+    """δu (F,) that minimises |rows (δu, 1)|² + |pull|² + |damping δu|²: the numbers of records, each behind its rows
+    (O, M, L + 1), are eliminated from those that all share."""
+    own, shared, alone = unknowns.own, unknowns.shared, unknowns.of_owners
+
+    def beside(places: np.ndarray) -> np.ndarray:
+        """The rows of damping and pull of the unknowns at `places` (..., K), and their residuals: (..., 2 K, K + 1)."""
+        weights, count = [np.append(x, 1.0)[places] for x in (damping, pull[0])], places.shape[-1]
+        found = np.zeros((*places.shape[:-1], 2 * count, count + 1))
+        for k, weight in enumerate(weights):
+            found[..., k * count + np.arange(count), np.arange(count)] = weight
+        found[..., count:, -1] = np.append(pull[1], 0.0)[places]
+        return found
+
+    r = rows
+    if own:
+        more = np.zeros((len(rows), 2 * own, rows.shape[-1]))
+        more[..., [*range(own), -1]] = beside(alone)
+        r = qr_triangle(np.concatenate([rows, more], axis=1))
+    rest = compress_rows(r[:, own:, own:].reshape(1, -1, len(shared) + 1))[0]
+    triangle = qr_triangle(np.concatenate([rest, beside(shared)]))
+    du = np.zeros(unknowns.count + 1)
+    du[shared] = np.linalg.solve(triangle[: len(shared), : len(shared)], -triangle[: len(shared), -1])
+    if own:
+        right = r[:, :own, -1] + r[:, :own, own:-1] @ du[shared]
+        du[alone] = np.linalg.solve(r[:, :own, :own], -right[..., None])[..., 0]
+    return du[:-1]
+
+
+def column_norms(triangles: np.ndarray, states: int, unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray]:
+    """The norms of the columns of starts (N, 2n) and of unknowns (F,); one where nothing depends on a column."""
     of_starts = np.linalg.norm(triangles[..., :states], axis=1)
-    of_u = np.linalg.norm(triangles[..., states:-1], axis=(0, 1))
+    of_u = unknowns.norms(np.linalg.norm(triangles[..., states:-1], axis=1))
     return np.where(of_starts > 0, of_starts, 1.0), np.where(of_u > 0, of_u, 1.0)

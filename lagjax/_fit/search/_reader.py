@@ -88,11 +88,12 @@ def _local_cubics(ts, t, y, window: int):
     return cubics[:, 0], cubics[:, 1], float(np.sqrt(np.mean(left**2) * window / dof)), cubics
 
 
-def short_windows(readers: list[Reader], length: float) -> tuple[list[Record], np.ndarray]:
-    """Records of this `length` along local cubics at some places of all records, and the states there. Their motions
-    see the curvature of the cubics, the data's accelerations, without a second derivative of the data."""
-    found, states, offsets = [], [], np.linspace(0.0, length, 4)
-    for reader in readers:
+def short_windows(readers: dict[int, Reader], length: float) -> tuple[list[Record], np.ndarray, list[int]]:
+    """Records of this `length` along local cubics at some places of all records, the states there, and the record that
+    each is of. Their motions see the curvature of the cubics, the data's accelerations, without a second derivative of
+    the data."""
+    found, states, owners, offsets = [], [], [], np.linspace(0.0, length, 4)
+    for record, reader in readers.items():
         places = even_places(len(reader.record), max(4, _WINDOWS_IN_ALL // len(readers)))
         cubics = [one[3] for one in reader.read(places)]
         values = np.stack([np.polynomial.polynomial.polyval(offsets, c.T) for c in cubics], axis=-1)
@@ -101,7 +102,8 @@ def short_windows(readers: list[Reader], length: float) -> tuple[list[Record], n
             inputs = structure and split_leaves(reader.record.interpolate_inputs(ts), *structure)
             found.append(Record(ts, restore_structure(shown, reader.record), inputs))
         states.append(reader.states(places))
-    return found, np.concatenate(states)
+        owners += [record] * len(places)
+    return found, np.concatenate(states), owners
 
 
 class TimeScales(NamedTuple):
@@ -112,8 +114,8 @@ class TimeScales(NamedTuple):
 
 
 def time_scales(readers: list[Reader], motions: AbstractMotions, numbers: np.ndarray) -> TimeScales:
-    """The shortest times over which a motion looks like a straight line, with the parameters `numbers` (P,): spread
-    over rate in the data, √(spread over acceleration) in the scene; infinite where nothing moves."""
+    """The shortest times over which a motion looks like a straight line, with parameters `numbers` (N, P): spread over
+    rate in the data, √(spread over acceleration) in the scene; infinite where nothing moves."""
     places = [even_places(len(reader.record), _PROBES) for reader in readers]
     states = [reader.states(some) for reader, some in zip(readers, places, strict=True)]
     times = [reader.record.ts[some] for reader, some in zip(readers, places, strict=True)]
@@ -121,7 +123,8 @@ def time_scales(readers: list[Reader], motions: AbstractMotions, numbers: np.nda
     within = np.concatenate([state[:, :n] - state[:, :n].mean(axis=0) for state in states])
     inputs = [reader.record.interpolate_inputs(ts) for reader, ts in zip(readers, times, strict=True)]
     t, inputs = np.concatenate(times), np.concatenate(inputs)
-    pulled = motions.rate(t, y, numbers, constant_tables(t, inputs))
+    each = np.repeat(numbers, list(map(len, states)), axis=0)
+    pulled = motions.rate(t, y, each, constant_tables(t, inputs))
     pulled = np.where(np.isfinite(pulled), pulled, 0.0)
     spread, rate, pulled = (np.sqrt(np.mean(x**2, axis=0)) for x in (within, y[:, n:], pulled))
     spread = np.minimum(spread, _QUARTER * np.array(readers[0].periods))
@@ -146,8 +149,12 @@ def build_reader(record: Any, about: SystemResiduals, numbers: np.ndarray, probe
 
 def read_records(residuals: Residuals) -> list[Reader | None]:
     """A reader for each record whose signals are positions, None for others; a few hundred probes for each system."""
-    pairs, numbers = [(record, part) for part in residuals.parts for record in part.records], residuals.parameters.first
-    return [build_reader(record, part, numbers, max(8, 256 // len(part.records))) for record, part in pairs]
+    parameters, found = residuals.parameters, []
+    for part in residuals.parts:
+        probes, places = max(8, 256 // len(part.records)), parameters.places[part.frame.records]
+        rows = zip(part.records, parameters.first[places], strict=True)
+        found += [build_reader(record, part, numbers, probes) for record, numbers in rows]
+    return found
 
 
 def first_starts(residuals: Residuals, readers: list[Reader | None], params0: Any) -> np.ndarray:

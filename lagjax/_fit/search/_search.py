@@ -126,7 +126,7 @@ class Search:
         near = []
         for part in self.residuals.parts:
             if reading := self._readers_of(part):
-                scatter = np.sqrt(np.mean([np.square(reader.scatter) for reader in reading], axis=0))
+                scatter = np.sqrt(np.mean([np.square(reader.scatter) for reader in reading.values()], axis=0))
                 near.append(np.maximum(_POOR * scatter, _COARSE * part.size[: len(scatter)]))
         ratio = done.noise.sigma / np.concatenate(near)
         return _ShortestSegments(done.trial.u, cuts, best, float(np.mean(np.log(ratio))), done)
@@ -147,28 +147,34 @@ class Search:
 
     def _fit_short_windows(self, u, anchor: Anchor) -> np.ndarray:
         """The u that suits the accelerations of local cubics: these have one minimum where segments are too long."""
-        short, states = [], []
+        short, states, owners = [], [], []
         for part, scale in zip(self.residuals.parts, self._time_scales(u), strict=True):
             if np.isfinite(scale):
-                records, begun = short_windows(self._readers_of(part), 0.25 * scale)
+                records, begun, of = short_windows(self._readers_of(part), 0.25 * scale)
                 states.append(pad_states(begun, self.residuals.states))
                 short.append(part.with_records(records, np.ones(len(records), bool)))
+                owners += of
         if not short:
             return u
-        part = Residuals(short)
+        part = Residuals(short, self.residuals.parameters.select(owners))
         point = Point(u, np.concatenate(states)[:, : part.states])
         with contextlib.suppress(LostMotion):
             return minimise(part, point, self.law, _ENOUGH_OF_WINDOWS, _TRIALS_OF_LEVEL, anchor).trial.u
         return u
 
-    def _readers_of(self, part: SystemResiduals) -> list[Reader]:
-        return [reader for reader in self.readers[part.frame.records] if reader is not None]
+    def _readers_of(self, part: SystemResiduals) -> dict[int, Reader]:
+        """The readers of the records of a system, by the number of each."""
+        places = range(part.frame.records.start, part.frame.records.stop)
+        return {k: reader for k in places if (reader := self.readers[k]) is not None}
 
     def _time_scales(self, u) -> list[float]:
         """The duration for which the motion of each system looks like a straight line; infinite without readers."""
-        numbers = self.residuals.parameters.numbers(u)
-        pairs = [(part.motions, self._readers_of(part)) for part in self.residuals.parts]
-        return [min(time_scales(reading, motions, numbers)) if reading else np.inf for motions, reading in pairs]
+        parameters, found = self.residuals.parameters, []
+        for part in self.residuals.parts:
+            reading = self._readers_of(part)
+            numbers = parameters.numbers(u)[parameters.places[list(reading)]]
+            found.append(min(time_scales(list(reading.values()), part.motions, numbers)) if reading else np.inf)
+        return found
 
     def _cut_records(self, u) -> list[list[Piece]]:
         pairs = zip(self.residuals.parts, self._time_scales(u), strict=True)

@@ -10,16 +10,16 @@ contacts, whatever they do (`InContact`). Where a watch falls,
     what friction has left    it slides, against the force that held it
 
 A guess that is wrong is a watch that begins beyond zero, or whose first coefficient that is not rounding is negative:
-it falls at once, and the next round takes it back (`_native._events`). That is Murty's principal pivoting, over series
-in place of numbers (Murty, Linear Algebra Appl. 5 (1972) 65; Heemels, Schumacher & Weiland, ibid. 294 (1999) 93).
-Bounces that accumulate end at a closed form of their limit (`end_bounces`).
+it falls at once, and the next round takes it back (`_native.steps._events`). That is Murty's principal pivoting, over
+series in place of numbers (Murty, Linear Algebra Appl. 5 (1972) 65; Heemels, Schumacher & Weiland, ibid. 294 (1999)
+93). Bounces that accumulate end at a closed form of their limit (`end_bounces`).
 
     follow ─► begin ─► prepare: sides and rounding of all watches ─► the kernel ─► finish ─► decide: a row of the record
                           ▲                                                                     │
                           └─────────────────────────────────────────────────────────────────────┘
 
 `scene` holds sizes, addresses of machine code, and the places of what is remembered of a member, its `member`, and of
-what a `row` of the record says; they are declared in `_places`. A flag is 0 or 1. `work` is room that nobody else has.
+what a `row` of the record says; they are declared in `_places`. A flag is 0 or 1. `work` is scratch memory.
 """
 
 from math import isfinite, sqrt
@@ -54,31 +54,32 @@ from lagjax._run.jumps import GOING, LEAST, bind_law, bind_loops, copy, find_sig
 )  # fmt: skip
 CLOSES, OPENS, BOUNCES, STICKS, SLIDES = range(5)  # the kinds of `ContactChanges`
 SEQUENTIAL, POISSON = 1, 2
-# The time that bounces still take, in parts of a step of the motion between them, below which they end in closed form,
-# and what that leaves out: twice as long, heights of 4e-9 of those of a step are left out.
+# Remaining bounce time, as a fraction of a step, below which a sequence of bounces is replaced by its limit, and the
+# error of that, 1e-14 of a height in a step; doubling `SHORT` gives 4e-9.
 SHORT, LEFT_OUT = 1e-4, 1e-14
-# Forces that are none, in parts of those that stop the bodies within a step: some fifty roundings.
+# Forces that count as zero, as a fraction of those that stop the bodies within a step: some fifty roundings.
 FORCELESS = 1e-14
-# How far below zero a gap counts as gone through: a hundred local errors, of its largest terms.
+# A gap counts as passed if it is this many local errors of its largest terms below zero.
 THROUGH = 100.0
-# What sliding leaves of a contact's response at which it is lost: a paradox, to rounding.
+# The response of a contact to its normal force, relative to that without sliding, below which it is zero to rounding:
+# Painlevé's paradox.
 PARADOX = 1e-12
-# How many of its roundings a gap may move in a step by a force that counts as none, where no other choice is left.
+# A gap may move by this many of its roundings in a step by a force that counts as zero, if no other choice is left.
 TIED_MOVES = 1e3
-# The slip in space that has no direction of its own, in parts of the largest one; and in parts of what a force that
-# breaks away brings about in a step. Half of that takes √2 times the steps, of some ten thousand: at rest friction
-# turns a slip at once, and steps are as short as that takes.
+# Below `NO_SLIP` of the largest slip, a spatial slip has no reliable direction. `AT_REST` is the same for a slip caused
+# within one step by a force that exceeds friction. Halving `AT_REST` takes √2 times the steps, of some ten thousand:
+# near rest friction turns a slip at once, and steps have to resolve that.
 NO_SLIP, AT_REST = 1e-11, 1e-8
-# By how much what happens at one instant may vary apart, for a tangent of length one: rounding.
+# Instants of two simultaneous changes may differ in their derivatives by this much, for a tangent of length one.
 TOGETHER = 1e-8
 HARDLY = 1e-6  # of the largest velocities so far: a contact that moves apart slower may close
 GAINED = 1e-12  # of the room of an impact: a gain of energy beyond rounding
 # Of the largest slip so far: what is more, where the slip along its first direction ends, has turned.
 TURNED = 1e-6
-# How far beyond a corner a motion goes on, in parts of the terms that say where it is; and how many of the smallest
-# steps before it an event stops it: steps that end at a border may be refused, and halve what is left.
+# After a corner a motion continues from this fraction of the terms of its switching number beyond it. An event stops
+# it `BEFORE` the corner: steps that end at a border may be rejected, and halve the rest.
 BEYOND, BEFORE = 16.0 * EPS, 64.0 * SMALLEST_STEP
-# The time that it takes to go beyond, in parts of the motion, from which on a contact rests on its corner.
+# If crossing a corner takes more than this fraction of the time of the motion, the contact rests on the corner.
 ON_CORNER = 1e-10
 INFINITY, MISSING = float("inf"), float("nan")
 OPEN, HELD = range(2)  # the modes
@@ -164,9 +165,9 @@ def measure_slips(scene: Scene, member: Member, rates: Floats, v: Floats, slips:
 
 @loop
 def locate_corners(scene: Scene, member: Member, x: Floats, room: Room) -> float:
-    """Put the sides of corners at inputs x, their rates, and how far beyond them it goes on: (corners,) each.
+    """Put the sides of corners at inputs x, their rates, and the distance to continue beyond: (corners,) each.
 
-    Returns how near they count.
+    Returns the distance below which a state counts as on a corner.
     """
     n, count, inputs, found = scene.n, scene.corners, scene.inputs, room.corner
     t, largest, near = x[2 * n], member.largest, 0.0
@@ -423,8 +424,8 @@ def finish(
 
     `fell` (G,) says which watches fell or rose, if it is an `event`; `result` is that of a run without one.
     """
-    n, k, total, times, x = scene.n, scene.k, scene.watches, scene.times, member.x
-    row, doing = record[int(member.rounds) * scene.row :], scene.doing
+    n, k, total, x = scene.n, scene.k, scene.watches, member.x
+    row = record[int(member.rounds) * scene.row :]
     deciding, start, begun = total - scene.sections, x[2 * n], x[2 * n + 1 + scene.numbers :]
     for i in range(scene.row):
         row[i] = 0.0
@@ -432,7 +433,7 @@ def finish(
     for g in range(deciding):
         decides = decides or (happens and fell[g] > 0)
     if not happens and result == SUCCESSFUL:
-        t_end = ts[times - 1]
+        t_end = ts[scene.times - 1]
     at_once = t_end == start
     write_outputs(scene, ts, start, t_end, found[2 * n :], begun, path, did)
     if decides:
@@ -444,7 +445,7 @@ def finish(
     row.end, row.watch, row.crosses = t_end, float(first), float(crosses)
     row.happens, row.decides = float(happens), float(decides)
     row.ran, row.t_impact = 1.0, MISSING
-    copy(begun, row.did, doing)
+    copy(begun, row.did, scene.doing)
     if crosses or not happens:
         copy(y_end, x, 2 * n)
         x[2 * n] = t_end
@@ -461,17 +462,24 @@ def finish(
         member.came[first - deciding] = 2.0 * fell[first] - 3.0
         row.contact, row.change = float(k + first - deciding), -1.0
     copy(x, row.behind, 2 * n)
-    if scene.corners > 0 and happens:  # time itself may go beyond its corner
-        for j in range(times):
-            if ts[j] <= x[2 * n] and did[j * doing] < 0:
-                copy(x, path[j * 2 * n :], 2 * n)
-                copy(row.did, did[j * doing :], doing)
+    if scene.corners > 0 and happens:
+        write_passed_outputs(scene, member, ts, path, did, row)
     member.rounds += float(happens)
     member.rows += 1.0
     reached = find_result(scene, member, reached, happens)
     member.result = float(reached)
     if reached == SUCCESSFUL:
         check_outputs(scene, member, ts, path, did, room)
+
+
+@loop
+def write_passed_outputs(scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, row: Entry):
+    """Put the outputs at which a motion is that continues beyond a corner, also of time."""
+    n, x, doing = scene.n, member.x, scene.doing
+    for j in range(scene.times):
+        if ts[j] <= x[2 * n] and did[j * doing] < 0:
+            copy(x, path[j * 2 * n :], 2 * n)
+            copy(row.did, did[j * doing :], doing)
 
 
 @loop
@@ -551,7 +559,7 @@ def find_first(scene: Scene, fell: Floats, at_once: bool, did: Floats) -> int:
 
 @loop
 def decide(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> int:
-    """The result behind watch `first`, which fell: state and contacts of the member go on there, as the row says."""
+    """The result behind watch `first`, which fell: the member continues from there, as the row says."""
     n, k, r, x, meets, opening = scene.n, scene.k, scene.r, member.x, row.meets, room.opening
     closed = x[2 * n + 1 + scene.numbers :]
     copy(closed, room.closed, k)
@@ -632,7 +640,7 @@ def note_changes(scene: Scene, member: Member, first: int, hits: bool, row: Entr
 
 @loop
 def meet_corners(scene: Scene, member: Member, first: int, meets: Floats, room: Room) -> int:
-    """Put which contacts come to a corner where watch `first` fell, and open there; the state and time go beyond it.
+    """Put which contacts reach a corner where watch `first` fell, and open there; state and time continue beyond it.
 
     Returns 2 where one is struck at its corner, or stays there, 1 where one meets behind its corner, else 0.
     """
@@ -745,11 +753,11 @@ def find_pushes(scene: Scene, member: Member, row: Entry, room: Room):
 
 @loop
 def close_contacts(scene: Scene, member: Member, first: int, hits: bool, meets: Floats, room: Room):
-    """Close and open what watch `first` says, and stick and slide; of contacts that meet, `PARTS` are those that go on.
+    """Update which contacts are closed, stick and slide after watch `first`; `PARTS` are those that separate.
 
-    A gap that falls while it moves apart is zero to more than the rounding of its terms: it goes on beyond that. Where
-    it hardly moves, as at the end of many bounces, it closes. A slip in space that has turned goes on. Where one stops
-    others of the same body may, which then stick as well. Where parts align, a slip that gaps hold passes through zero,
+    A gap that falls although its contacts separate is zero to more than the rounding of its terms: it continues. If it
+    hardly moves, as at the end of many bounces, it closes. A spatial slip that has turned continues. If one stops,
+    others of the same body may, and stick as well. When parts align, a slip that gaps determine passes through zero,
     and turns.
     """
     n, k, r, d, x, rough = scene.n, scene.k, scene.r, scene.d, member.x, scene.rough
@@ -812,9 +820,9 @@ def find_change(scene: Scene, member: Member, hits: bool, row: Entry, room: Room
         stuck[c] = (1.0 - stuck[c]) * push[rough[c]] if hits else 0.0  # from here on those that slide
     add_rates(rates, coupling, impulses, room.apart, size)
     for j in range(n):
-        room.change[j] = 0.0
+        room.jump[j] = 0.0
         for i in range(size):
-            room.change[j] += impulses[i] * room.responses[i * n + j]
+            room.jump[j] += impulses[i] * room.responses[i * n + j]
     return wrong
 
 
@@ -834,7 +842,12 @@ def ask_rates(scene: Scene, member: Member, hits: bool, row: Entry, room: Room):
         for i in range(k):
             targets[i] = -e[i] * room.rates[i]
     elif scene.r > 0:
-        construct(e[0], member.mu[0], room.coupling, room.rates, targets, row.direction)
+        x = room.free
+        copy(room.coupling, x, 4)
+        copy(room.rates, x[4:], 2)
+        x[6], x[7] = e[0], member.mu[0]
+        evaluate(scene.construct, x, x[8:])
+        targets[0], row.direction[0] = x[8], x[9]
 
 
 @loop
@@ -855,32 +868,6 @@ def is_violated(scene: Scene, member: Member, row: Entry, room: Room) -> bool:
         if flags[i] > 0:
             return True
     return False
-
-
-@loop
-def construct(e: float, mu: float, coupling: Floats, rates: Floats, target: Floats, direction: Floats):
-    """Put the rate behind an impact of one contact in a plane, and −F/μΛ, by Routh's construction.
-
-    As the normal impulse Λ grows, friction acts against the slip of that moment. Where that has stopped the contact
-    sticks, if friction suffices, or slides on the other way. Compression ends where the rate is zero, the impact at
-    1 + e times its impulse (Wang & Mason, J. Appl. Mech. 59 (1992) 635).
-    """
-    normal, mixed, tangential, rate, slip = coupling[0], coupling[1], coupling[3], rates[0], rates[1]
-    side = -1.0 if slip < 0 else 1.0
-    slows = mu * tangential - side * mixed  # of the slip, by Λ; it is positive where friction could jam
-    stops = INFINITY
-    if slip == 0 or slows > 0:
-        stops = abs(slip) / (slows if slows > 0 else 1.0)
-    held = min(max(mixed / tangential, -mu), mu)  # −dF/dΛ from there on
-    slope, then = normal - mu * side * mixed, normal - held * mixed
-    compression = -rate / slope
-    if not slope * stops >= -rate:  # the slip ends before compression does
-        compression = stops + (-rate - slope * stops) / then
-    impulse = (1.0 + e) * compression
-    slides = min(impulse, stops)
-    force = -mu * side * slides - held * (impulse - slides)
-    target[0] = rate + normal * impulse + mixed * force
-    direction[0] = -force / (mu * impulse) if mu * impulse > 0 else 0.0
 
 
 @loop
@@ -950,7 +937,7 @@ def stay_closed(scene: Scene, member: Member, hits: bool, room: Room):
             return
     copy(member.opened, x, scene.inputs)
     for j in range(n):
-        x[n + j] += room.change[j]
+        x[n + j] += room.jump[j]
     evaluate(scene.response, x, behind)
     bends = behind[2 * k * n + k * k + 2 * k :]
     find_pattern(
@@ -973,7 +960,7 @@ def rub(scene: Scene, member: Member, first: int, hits: bool, room: Room):
     if first >= k and first < k + r and was_stuck[first - k] > 0:
         write_held_force(scene, member, first - k, v, room)
     for j in range(n):
-        v[j] = x[n + j] + room.change[j]
+        v[j] = x[n + j] + room.jump[j]
     measure_slips(scene, member, apart, v, behind, room)
     lasts = member.longest if member.longest > 0 else member.last - member.first
     for c in range(r):
@@ -1043,7 +1030,7 @@ def move(scene: Scene, member: Member, first: int, meets: Floats, row: Entry, ro
     """
     n, k, size, x = scene.n, scene.k, scene.k + scene.r * scene.d, member.x
     responses, coupling, largest = room.responses, room.coupling, member.largest
-    offset, change, lost = row.offset, room.change, 0.0
+    offset, change, lost = row.offset, room.jump, 0.0
     for i in range(size):
         for j in range(n):
             part = room.impulses[i] * room.gradients[i * n + j]
@@ -1082,7 +1069,7 @@ def note_force_noise(scene: Scene, member: Member, first: int, room: Room):
     for i in range(scene.k):
         own, fast = room.coupling[i * (scene.k + scene.r * scene.d) + i], 0.0
         for j in range(n):
-            fast += abs(room.gradients[i * n + j]) * max(abs(x[n + j]), abs(x[n + j] + room.change[j]))
+            fast += abs(room.gradients[i * n + j]) * max(abs(x[n + j]), abs(x[n + j] + room.jump[j]))
         if longest > 0:
             least = FORCELESS * (fast / own) / longest
             values[total + i] = max(values[total + i], least)

@@ -1,9 +1,9 @@
 """The corners of contacts: borders at which a gap, its rate or a slip jumps (`abs`, `maximum`, `where`, tables).
 
-While a contact is open its corners are borders as those of L are, and nothing happens there. One that is closed opens
-where it comes to a corner, with the motion on the far side, by a few roundings; the watches of that side then tell
-whether it strikes, stays or leaves. On the corner itself there is no one direction in which it pushes: what is struck
-there, or rests there, ends.
+While a contact is open, its corners are borders as those of L are, and nothing happens there. A closed contact that
+reaches a corner opens, and the motion continues a few roundings beyond; the watches of that side then tell whether it
+strikes, stays or leaves. On the corner itself a contact has no unique normal: a motion that is struck there, or rests
+there, ends.
 """
 
 import dataclasses

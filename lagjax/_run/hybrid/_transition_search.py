@@ -18,16 +18,15 @@ TOO_MANY, INCONSISTENT, ZENO, IN_TURN, NOT_FINITE = map(
 )  # fmt: skip
 BY_TARGET, BEYOND, CROSSING = range(3)  # how a transition fires
 EPS = 2.0**-52
-# How far the logarithms of two ratios of a geometric sequence may differ, as a part of them. Times of a Zeno motion
-# approach a geometric sequence; twice this would take a slowly changing rhythm for one.
+# The relative difference that is allowed between the logarithms of two ratios of a geometric sequence. Times of a Zeno
+# motion approach a geometric sequence; doubled, a slowly changing rhythm would count as one.
 STEADY = 0.05
-# Transitions at one instant that are said to go back and forth: a chain of as many is longer than any that passes on a
-# blow among a few balls. And how long before it the last other one was, in parts of the time: bounces that pile up come
-# as near to their end as rounding lets them.
+# This many transitions at one instant alternate for ever: a chain of blows among a few balls is shorter. `APART` is the
+# minimal pause before them, relative to t; shorter pauses mean accumulating bounces.
 IN_ONE_PLACE, APART = 8, 1e-9
-# Blows at one instant that are followed in both orders of the list, and by how much of its largest value a number of
-# the state may differ behind them: far more than rounding of some thirty blows. Twice as many blows settle more of
-# those of restitution below one, whose last ones are small.
+# Up to this many blows at one instant are computed in both orders of the list. `SAME` is the difference of a number of
+# the state after them that is allowed, relative to its largest value: far more than the rounding of thirty blows. Twice
+# as many blows would settle more cases of restitution below one, whose last blows are small.
 MOST_BLOWS, SAME = 32, 1e-9
 INFINITY, MISSING = float("inf"), float("nan")
 watch, write_times, write_outputs = bind_loops(globals())
@@ -143,7 +142,7 @@ def write_side(scene: Scene, member: Member, mode: int, g: int, room: Room):
 def turns_round(scene: Scene, member: Member, mode: int, g: int, rate: float, room: Room) -> bool:
     """True for a guard whose reset keeps it off its surface: turns it round, or puts it back.
 
-    A kick that leaves it to go on does not, nor does a section without a reset.
+    A kick after which it continues does not, nor does a section without a reset.
     """
     total, j, watches, way = scene.counts[mode], scene.first_of[mode] + g, room.watched, 0.0
     if scene.resets[j] == 0 or scene.way[j] == 0:
@@ -209,7 +208,7 @@ def finish(
 def pass_transition(
     scene: Scene, member: Member, mode: int, k: int, turns: bool, result: int, row: Entry, room: Room
 ) -> int:
-    """The result behind guard k, whose transition happens, or none if it is −1: the member goes on there.
+    """The result behind guard k, whose transition happens (none if k is −1), from which the member continues.
 
     Where that `turns` a guard at once, against its rate, the motion that does so is lost in rounding.
     """
@@ -250,8 +249,8 @@ def pass_transition(
 def note_sides(scene: Scene, member: Member, mode: int, room: Room):
     """Note the sides before a reset of the guards of this mode, and their rounding; of others nothing is known.
 
-    A guard that changes comes from the side that it leaves. Another one that is on its surface comes from where it
-    began, if it stays there since or has no rate, and else from where its rate does.
+    Guards that fired: the side they left. Guards on their surface: the side they started on if they have stayed or have
+    no rate; otherwise the side opposite to their rate.
     """
     total, first, watched, fell = scene.counts[mode], scene.first_of[mode], room.watched, room.fell
     for j in range(scene.k):
@@ -297,9 +296,9 @@ def has_orders(scene: Scene, member: Member, mode: int, room: Room) -> bool:
 
 @loop
 def follow_blows(scene: Scene, member: Member, mode: int, backwards: bool, x: Floats, room: Room):
-    """Put the inputs behind the blows of guards that are there, each as long as its guard goes on in its direction.
+    """Apply the blows of the guards at zero to the inputs x, each while its guard still moves in its direction.
 
-    Each comes once before its guard has been turned.
+    Each is applied at least once.
     """
     total, first, watches = scene.counts[mode], scene.first_of[mode], room.other
     armed, goes = room.armed, room.goes

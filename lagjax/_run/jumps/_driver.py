@@ -5,7 +5,7 @@
                           └───────────────────────────────────────────────────────────┘
 
 A law declares its places, and gives the loops `start`, `prepare`, `finish` and `find_mode` (`bind_law`). A flag is
-0 or 1. `work` is room that nobody else has.
+0 or 1. `work` is scratch memory.
 """
 
 from math import isfinite
@@ -20,7 +20,7 @@ Entry: TypeAlias = Any
 Room: TypeAlias = Any
 start = prepare = finish = find_mode = cast(Any, None)
 
-# Results of a motion that goes on, of one whose stretch the kernel did not finish, and of one that has not begun.
+# Results while a motion is followed, when the kernel did not finish its stretch, and before it begins.
 GOING, ASKS, NEW = -1, -2, -3
 LEAST = 1e-300  # a side that is exactly zero still has a sign
 
@@ -93,7 +93,7 @@ def write_outputs(
 def follow(
     scene: Scene, members: int, ts: Floats, path: Floats, did: Floats, record: Entry, memory: Member, room: Room
 ):
-    """Follow members that go on to their ends, or to a stretch that the kernel does not finish (`ASKS`).
+    """Follow members to their ends, or to a stretch that the kernel does not finish (`ASKS`).
 
     `ts` (T,) are the same for all if `scene` has one row of them, or (members, T). Members run side by side: those
     that are going are packed for one call of the kernel, those of each mode apart.

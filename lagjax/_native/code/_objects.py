@@ -1,0 +1,156 @@
+"""Machine code kept on disk, so that a second process need not make it again.
+
+An object file is known by all that it was made from: the text of its module, the processor, what was done with the text
+and by which LLVM. Nothing of a process is in it: functions of the C library are called by name. Files are written under
+another name first and then renamed, so that any number of processes may read and write them at once; one that is cut
+short or damaged is not what its first bytes say, and is made anew. Where files cannot be read or written, nothing is
+kept, and nothing fails.
+
+They lie in the user's folder for caches. The environment variable `LAGJAX_CACHE` names another one; `off` keeps none.
+What is read is run. So a folder is used only if it is the user's own and no other user may write to it; in another one,
+such as /tmp, a folder of its own is made, and without that nothing is kept, which one warning says. A file is read only
+if it is a regular one of the user's, with no link followed.
+"""
+
+import contextlib
+import functools
+import hashlib
+import os
+import stat
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+# Bytes of all files, beyond which the ones that were not used for longest go until a quarter is free. A double pendulum
+# takes 60 kB, a chain of 16 half a megabyte.
+LARGEST_CACHE = 2**28
+# Bytes that this process may write into a folder until it looks at all files there again: a sixteenth of the largest
+# sum, since a look at 6400 files takes 25 ms, which each of them took when every new object looked. So the folder may
+# exceed that sum by a sixteenth for every process that writes. A process looks at its first object.
+_LEFT: dict[Path, int] = {}
+_MAGIC = b"lagjax object 1\n"
+_DIGEST = hashlib.sha256
+# A link may lead to another file than the one that is looked at, and a named pipe waits for a writer for ever.
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+
+
+def folder() -> Path | None:
+    """The folder of kept objects; None where none are kept."""
+    chosen = os.environ.get("LAGJAX_CACHE", "")
+    if chosen:
+        return None if chosen.lower() in ("off", "0", "no", "false") else Path(chosen).expanduser()
+    try:
+        if sys.platform == "win32":
+            base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
+        elif sys.platform == "darwin":
+            base = Path.home() / "Library" / "Caches"
+        else:
+            base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:  # there is no home
+        return None
+    return base / "lagjax" / "objects"
+
+
+def private_folder(place: Path) -> Path | None:
+    """This folder, made if need be, where it is the user's alone; else one inside of it; None where neither can be."""
+    inside = place / f"lagjax-{os.geteuid() if hasattr(os, 'geteuid') else 'user'}"
+    for candidate in (place, inside):
+        with contextlib.suppress(OSError):
+            candidate.mkdir(mode=0o700, parents=True, exist_ok=True)
+            status = os.lstat(candidate)
+            if stat.S_ISDIR(status.st_mode) and _is_private(status):
+                return candidate
+    _warn_once(place)
+    return None
+
+
+def _is_private(status: os.stat_result) -> bool:
+    """True if a file or folder is the user's own, and no other user may write to it."""
+    if not hasattr(os, "geteuid"):  # Windows, where the folder for caches is the user's
+        return True
+    return status.st_uid == os.geteuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+
+
+@functools.cache
+def _warn_once(place: Path) -> None:
+    warnings.warn(
+        f"Machine code is not kept: {place} is no folder that only you can write to. Set LAGJAX_CACHE to one of your "
+        "own, or to 'off'.",
+        stacklevel=2,
+    )
+
+
+def load_or_make(make: Callable[[], bytes], *made_from: str) -> bytes:
+    """The object that `make` returns, or the one that it returned for the same texts in this or another process."""
+    chosen = folder()
+    place = None if chosen is None else private_folder(chosen)
+    if place is None:
+        return make()
+    digest = _DIGEST()
+    for text in made_from:
+        digest.update(len(text).to_bytes(8, "little") + text.encode())
+    file = place / f"{digest.hexdigest()}.o"
+    found = _read(file)
+    if found is not None:
+        return found
+    made = make()
+    with contextlib.suppress(OSError):
+        _write(file, made)
+        _LEFT[place] = _LEFT.get(place, 0) - len(made)
+        if _LEFT[place] <= 0:
+            _remove_oldest(place)
+            _LEFT[place] = LARGEST_CACHE // 16
+    return made
+
+
+def _read(file: Path) -> bytes | None:
+    """The bytes that were written to a file; None where there is none, it is damaged, or may be somebody else's."""
+    try:
+        number = os.open(file, os.O_RDONLY | _NO_LINK)
+        with os.fdopen(number, "rb") as opened:
+            status = os.fstat(number)
+            if not (stat.S_ISREG(status.st_mode) and _is_private(status)):
+                return None
+            content = opened.read()
+    except OSError:
+        return None
+    begin = len(_MAGIC) + _DIGEST().digest_size
+    body = content[begin:]
+    if content[:begin] != _MAGIC + _DIGEST(body).digest():
+        return None
+    with contextlib.suppress(OSError):
+        os.utime(file)  # it was used now
+    return body
+
+
+def _write(file: Path, body: bytes) -> None:
+    number, name = tempfile.mkstemp(dir=file.parent, suffix=".part")
+    try:
+        with os.fdopen(number, "wb") as part:
+            part.write(_MAGIC + _DIGEST(body).digest() + body)
+        os.replace(name, file)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(name)
+        raise
+
+
+def _remove_oldest(place: Path) -> None:
+    """Remove the files that were not used for longest where all together are too large."""
+    files = []
+    with os.scandir(place) as entries:
+        for entry in entries:
+            with contextlib.suppress(OSError):  # another process removed it
+                status = entry.stat()
+                files.append((status.st_mtime, status.st_size, entry.path))
+    total = sum(size for _, size, _ in files)
+    if total <= LARGEST_CACHE:
+        return
+    for _, size, file in sorted(files):
+        if total <= 0.75 * LARGEST_CACHE:
+            break
+        with contextlib.suppress(OSError):
+            os.unlink(file)
+        total -= size

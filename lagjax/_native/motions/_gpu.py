@@ -1,0 +1,195 @@
+"""The motion of a kernel, and its transpose, as programs for NVIDIA GPUs: one thread a member.
+
+The modules of one lane that run on a CPU go, unchanged, through LLVM's target for PTX, the assembly language that the
+driver turns into machine code. An entry (`_gpu_entry`) builds the job on the stack of its thread and calls their
+`begin` and `run`; a thread whose member has ended takes the next one from the counter that all share. Functions that
+are no instruction come from libdevice, NVIDIA's library in LLVM's own form, which lies where pip has put
+`nvidia-cuda-nvcc`: `jax[cuda12]` depends on it.
+
+A program has one of two forms. Where the coefficients of a motion are few, the loops over orders are unrolled, at an
+order that is lower than a CPU's if that keeps them few: no array is left, and the coefficients are registers, some of
+which the assembler spills. Otherwise they stand in the memory of the thread.
+
+What is here needs no GPU: it is assembled and checked on CPUs. `benchmarks.gpu` runs it on one.
+"""
+
+import functools
+import math
+import os
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import llvmlite.binding as llvm
+from llvmlite import ir
+
+from lagjax._native.code._constants import LEAST_ORDER
+from lagjax._native.code._ir import DOUBLE, Code
+from lagjax._native.motions._gpu_entry import MOTION, TRANSPOSE, Entry, GpuForm, OneLane, motion_entry, transpose_entry
+from lagjax._native.series._taylor import TaylorSeries, order_for
+from lagjax._program import Unlowerable
+
+# Threads of a block, and blocks: a motion has as many as 132 multiprocessors hold with all registers of a thread, for
+# others would wait. With half as many, what a transpose spills stays in the caches, by `benchmarks.gpu_estimate`.
+THREADS = 64
+MOST_BLOCKS = {MOTION: 528, TRANSPOSE: 264}
+# Bytes that a thread may remember. The driver takes them for every thread that could be resident: of 2048 threads on
+# 132 multiprocessors 8 GiB.
+LARGEST_THREAD = 2**15
+# Drivers of CUDA 12.0 read PTX 8.0, and make code from PTX for sm_70 for every processor since.
+_PROCESSOR, _VERSION = "sm_70", "+ptx80"
+# Coefficients of a motion, of its state and of the rows of its products, up to which it is unrolled. By the counts of
+# `benchmarks.gpu_estimate`, with registers and spills as ptxas reports them, that is the best order to a tenth for a
+# double pendulum (12), one with constraints (10) and a slider-crank (7); by a third more the spills of the latter two
+# no longer stay in the caches. A chain of three has twice as many, and gains nothing. A transpose has three times the
+# values of a motion, and spills most of them; of a double pendulum it takes the least time at orders from 8 to 10.
+MOST_COEFFICIENTS = {MOTION: 250, TRANSPOSE: 200}
+# Doubles of the steps that all threads of a launch may write down: 2 GiB. Of a double pendulum, with as many threads as
+# there are, two thousand steps.
+LARGEST_RECORD = 2**28
+_FAR_ANGLES = ("sin", "cos")  # the C library's part in a sine is that of angles beyond 2**20
+_lock = threading.Lock()
+
+
+class GpuPrograms:
+    """The programs for GPUs of a kernel, made on first use.
+
+    `motion` and `adjoint` write down the modules of one lane. The tolerance chooses the order of the series. All raise
+    `Unlowerable`, whose text says why, where a GPU cannot run the program.
+    """
+
+    def __init__(self, motion: Callable[[], TaylorSeries], adjoint: Callable[[], TaylorSeries]):
+        self._lane = functools.cache(lambda: one_lane(motion()))
+        self._lane_back = functools.cache(lambda: one_lane(adjoint()))
+        self._motion = functools.cache(self._assemble_motion)
+        self._transpose = functools.cache(self._assemble_transpose)
+
+    def form(self, entry: Entry, rtol: float) -> GpuForm:
+        return form_for(entry, self._lane(), order_for(rtol))
+
+    def motion(self, rtol: float) -> str:
+        return self._motion(self.form(MOTION, rtol))
+
+    def transpose(self, rtol: float) -> tuple[str, int]:
+        """The motion of a member and back in PTX, and the doubles that are written down of a step."""
+        return self._transpose(self.form(TRANSPOSE, rtol)), self._lane().row
+
+    def _assemble_motion(self, form: GpuForm) -> str:
+        with _lock:
+            return _assembly(motion_entry(self._lane(), form.order), [_parse(self._lane(), form)])
+
+    def _assemble_transpose(self, form: GpuForm) -> str:
+        """The PTX of an integrator and of its adjoint, one after the other in one thread."""
+        lane, back = self._lane(), self._lane_back()
+        require_room(lane.size + back.size if form.unrolled else max(lane.size, back.size))
+        with _lock:
+            there_and_back = [_parse(lane, form), _parse(back, form)]
+            for name in ("begin", "run"):
+                there_and_back[1].get_function(name).name = f"{name}_back"
+            return _assembly(transpose_entry(lane, back, form), there_and_back)
+
+
+def form_for(entry: Entry, lane: OneLane, order: int) -> GpuForm:
+    """The form of a motion that should take the least time, where a CPU takes series of this `order`."""
+    fitting = MOST_COEFFICIENTS[entry] // lane.series
+    return GpuForm(order, False) if lane.large or fitting < LEAST_ORDER else GpuForm(min(order, fitting), True)
+
+
+def grid(entry: Entry, members: int) -> tuple[int, int]:
+    return min(MOST_BLOCKS[entry], max(1, -(-members // THREADS))), THREADS
+
+
+def require_room(doubles: int) -> None:
+    """Raise `Unlowerable` where a thread cannot remember this many numbers, which may be part of a motion's."""
+    if 8 * doubles > LARGEST_THREAD:
+        raise Unlowerable(
+            f"a thread of a GPU would have to remember at least {8 * doubles} bytes of a motion, "
+            f"more than {LARGEST_THREAD}; a CPU is the better choice"
+        )
+
+
+def one_lane(motion: TaylorSeries) -> OneLane:
+    """The module of a motion. Raises `Unlowerable`, whose text says why a GPU cannot run it."""
+    assert motion.width == 1, "a thread follows one member"
+    require_room(motion.layout.size)
+    if motion.look_up.numbers is not None:
+        raise Unlowerable("its tables of numbers (samples, jnp.interp, …) are not brought to a GPU; make them params")
+    return OneLane.from_motion(motion)
+
+
+def _parse(lane: OneLane, form: GpuForm) -> llvm.ModuleRef:
+    return llvm.parse_assembly(lane.unrolled if form.unrolled else lane.text)
+
+
+def _assembly(entry: str, parts: Sequence[llvm.ModuleRef]) -> str:
+    """The PTX of an entry, linked with the modules that it calls."""
+    machine = _target().create_target_machine(cpu=_PROCESSOR, features=_VERSION, opt=3)
+    called = [of for part in parts for of in part.functions if of.is_declaration and not of.name.startswith("llvm.")]
+    external = [of for of in called if of.name not in _FAR_ANGLES]
+    whole, others = llvm.parse_assembly(entry), [*parts, _refuse_far_angles()]
+    if external:
+        if (library := libdevice()) is None:
+            raise Unlowerable(
+                f"its {', '.join(sorted({of.name for of in external}))} come from NVIDIA's libdevice, which is not "
+                "here; `pip install nvidia-cuda-nvcc-cu12` has it"
+            )
+        others.append(llvm.parse_bitcode(library))
+        for function in external:
+            function.name = f"__nv_{function.name}"
+    for module in (whole, *others):
+        module.triple, module.data_layout = machine.triple, str(machine.target_data)
+    for module in others:
+        whole.link_in(module)
+    for function in whole.functions:
+        if not function.is_declaration and function.name != "integrate":
+            function.linkage = "internal"  # else all of the library stays
+    whole.verify()
+    return machine.emit_assembly(_optimise(whole, machine))
+
+
+def _refuse_far_angles() -> llvm.ModuleRef:
+    """A module in which the sine of an angle beyond 2**20 is NaN.
+
+    A step to there is refused, so that the motion ends and says so. libdevice has such sines, with a reduction that
+    every thread would keep room for.
+    """
+    module = ir.Module("far_angles")
+    module.triple = ""
+    for name in _FAR_ANGLES:
+        code = Code(module, name, [DOUBLE], lanes=1, result=DOUBLE, public=True)
+        code.finish(code.as_value(math.nan, DOUBLE))
+    return llvm.parse_assembly(str(module))
+
+
+def _optimise(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> llvm.ModuleRef:
+    """The module with its functions in one another, and its loops as they are but for those that ask to be unrolled."""
+    for function in module.functions:
+        if not function.is_declaration and function.name != "integrate":
+            function.add_function_attribute("alwaysinline")
+    options = llvm.create_pipeline_tuning_options(speed_level=3)
+    options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = False
+    first = llvm.create_new_module_pass_manager()
+    first.add_sroa_pass()  # before functions are in one another: else their variables save the stack pointer
+    first.run(module, llvm.create_pass_builder(machine, options))
+    builder = llvm.create_pass_builder(machine, options)
+    builder.getModulePassManager().run(module, builder)
+    return module
+
+
+@functools.cache
+def _target() -> llvm.Target:
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    return llvm.Target.from_triple("nvptx64-nvidia-cuda")
+
+
+@functools.cache
+def libdevice() -> bytes | None:
+    """NVIDIA's library of functions, as pip or CUDA's own installer has put it; None where it is not."""
+    toolkits = [os.environ[name] for name in ("CUDA_HOME", "CUDA_PATH") if name in os.environ] + ["/usr/local/cuda"]
+    places = [(folder or ".", "nvidia/*/nvvm") for folder in sys.path] + [(folder, "nvvm") for folder in toolkits]
+    for folder, inside in places:
+        for file in Path(folder).glob(f"{inside}/libdevice/libdevice.10.bc"):
+            return file.read_bytes()
+    return None

@@ -1,0 +1,227 @@
+"""The order in which a large program runs, and where its numbers lie: alike operations side by side.
+
+    operations   what the outputs need; sine and cosine of one angle are one operation with two results
+    joined       operations that often come together are one: a product and the sum that reads it, and then larger trees
+    groups       alike operations that wait for equally many others, and so not for each other
+    slots        where every result lies, from its making to its last use
+
+Nothing here knows LLVM.
+"""
+
+from collections import Counter
+from typing import NamedTuple
+
+from lagjax._native.code._constants import LARGEST_TREE, OFTEN, ROUNDS
+from lagjax._program import StraightLine, count_uses
+
+# What one operation may consist of; operands and results of these are of one kind.
+_JOINED = frozenset(("add", "sub", "mul", "neg", "div", "sqrt"))
+
+
+class OperationKind(NamedTuple):
+    """The kind of an operation: its name and attribute, and the kinds ("float", "bool", …) of operands and result.
+
+    `parts` has an entry for each operand: the operation that it is the result of, if that belongs to this one, or None.
+    """
+
+    op: str
+    attribute: object
+    kinds: tuple[str, ...]
+    result: str
+    parts: "tuple[OperationKind | None, ...]"
+
+    @property
+    def operands(self) -> int:
+        return sum(1 if part is None else part.operands for part in self.parts)
+
+    @property
+    def results(self) -> int:
+        return 2 if self.op == "sincos" else 1
+
+
+_Kinds = dict[OperationKind, int]  # the kinds of the operations of a program, numbered as they come
+
+
+class ScheduledOperation(NamedTuple):
+    """An operation: its kind, as a number, the nodes that it reads, and those that it makes (-1: unused)."""
+
+    kind: int
+    operands: tuple[int, ...]
+    results: tuple[int, ...]
+
+
+class Schedule(NamedTuple):
+    """A program in the order in which it runs.
+
+    Every group holds operations of one of the `kinds`. Node i lies in slot `slots[i]`, of which there are `size`; the
+    outputs that are `staying` lie in the first slots, in their order, and the others are stored: of a program of N
+    nodes, output k is node N + k then, and has no slot. `inputs` gives the position of every node that is an input, and
+    `constants` the number of one that is a number.
+    """
+
+    kinds: list[OperationKind]
+    groups: list[list[ScheduledOperation]]
+    slots: dict[int, int]
+    staying: int
+    size: int
+    inputs: dict[int, int]
+    constants: dict[int, float]
+
+
+def schedule(line: StraightLine, stored: int) -> Schedule:
+    """The order of operations that outputs need, and slots of results; the last outputs are `stored` elsewhere."""
+    nodes, uses = line.nodes, count_uses(line.nodes, line.outputs)
+    kinds: _Kinds = {}
+    operations = _join_pairs(_operations(line, uses, kinds), uses, kinds)
+    staying = len(line.outputs) - stored
+    outputs, copies = _outputs(line, operations, kinds, staying)
+    operations += copies
+    groups = _group_by_level(operations, len(nodes) + len(line.outputs))
+    slots, size = _slots(groups, outputs, staying, len(nodes))
+    live = [i for i, count in enumerate(uses) if count]
+    inputs = {i: nodes[i][2] for i in live if nodes[i][0] == "input"}
+    constants = {i: float(nodes[i][2]) for i in live if nodes[i][0] == "constant"}
+    return Schedule(list(kinds), groups, slots, staying, size, inputs, constants)
+
+
+# ---- operations ------------------------------------------------------------------------------------------------------
+
+
+def _number(kinds: _Kinds, kind: OperationKind) -> int:
+    return kinds.setdefault(kind, len(kinds))
+
+
+def _operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[ScheduledOperation]:
+    """The operations that the outputs need, each after those that it reads."""
+    angles: dict[int, list[int]] = {}  # the nodes of the sine and the cosine of each; -1 where one is not needed
+    for i, (op, operands, _) in enumerate(line.nodes):
+        if uses[i] and op in ("sin", "cos"):
+            angles.setdefault(operands[0], [-1, -1])[op == "cos"] = i
+    operations = []
+    for i, (op, operands, attribute) in enumerate(line.nodes):
+        if not uses[i] or op in ("input", "constant"):
+            continue
+        results = (i,)
+        if op in ("sin", "cos"):
+            op, results = "sincos", tuple(angles[operands[0]])
+            if i != min(x for x in results if x >= 0):
+                continue
+        of = tuple(line.kinds[x] for x in operands)
+        kind = _number(kinds, OperationKind(op, attribute, of, line.kinds[i], (None,) * len(of)))
+        operations.append(ScheduledOperation(kind, operands, results))
+    return operations
+
+
+def _outputs(
+    line: StraightLine, operations: list[ScheduledOperation], kinds: _Kinds, staying: int
+) -> tuple[dict[int, int], list[ScheduledOperation]]:
+    """The first outputs that nodes are, and copies for all others: that for output k of N nodes is node N + k."""
+    made = {x for operation in operations for x in operation.results}
+    outputs: dict[int, int] = {}
+    copies = []
+    copy, store = (_number(kinds, OperationKind(op, None, ("float",), "float", (None,))) for op in ("copy", "store"))
+    for k, i in enumerate(line.outputs):
+        if k < staying and i in made and i not in outputs:
+            outputs[i] = k
+            continue
+        if k < staying:
+            outputs[len(line.nodes) + k] = k
+        copies.append(ScheduledOperation(copy if k < staying else store, (i,), (len(line.nodes) + k,)))
+    return outputs, copies
+
+
+# ---- pairs that are fused --------------------------------------------------------------------------------------------
+
+
+def _join_pairs(operations: list[ScheduledOperation], uses: list[int], kinds: _Kinds) -> list[ScheduledOperation]:
+    """The operations, with a result that only one other reads computed inside that one, where such a pair comes often.
+
+    Pairs of pairs come often too, and so on: byte-pair encoding, with trees for strings.
+    """
+    made = {max(operation.results): operation for operation in operations}
+    ops = [kind.op for kind in kinds]
+    joined = [i for i, operation in made.items() if ops[operation.kind] in _JOINED]
+    once = {i for i in joined if uses[i] == 1}
+    for _ in range(ROUNDS):
+        pairs = Counter(
+            (made[i].kind, place, made[x].kind)
+            for i in joined if i in made for place, x in enumerate(made[i].operands) if x in once
+        )  # fmt: skip
+        if not (chosen := _frequent_pairs(pairs, kinds)):
+            break
+        for i in joined:
+            if i in made and made[i].kind in chosen:
+                kind, operands, results = made[i]
+                place, part, tree = chosen[kind]
+                x = operands[place]
+                if x in once and made[x].kind == part:
+                    operands = operands[:place] + made.pop(x).operands + operands[place + 1 :]
+                    made[i] = ScheduledOperation(tree, operands, results)
+    return list(made.values())
+
+
+def _frequent_pairs(pairs: Counter, kinds: _Kinds) -> dict[int, tuple[int, int, int]]:
+    """The pairs that come most often: for kinds of operations the operand that is joined, its kind, and that of both.
+
+    In one round a kind takes an operand in or is taken in by others, but for chains of one kind.
+    """
+    chosen: dict[int, tuple[int, int, int]] = {}
+    parts, numbered = set(), list(kinds)
+    for (kind, place, part), count in pairs.most_common():
+        if count < OFTEN:
+            break
+        if kind not in chosen and kind not in parts and (part not in chosen or part == kind):
+            tree = _insert_part(numbered[kind], place, numbered[part])
+            if tree.operands <= LARGEST_TREE:
+                chosen[kind] = place, part, _number(kinds, tree)
+                parts.add(part)
+    return chosen
+
+
+def _insert_part(kind: OperationKind, place: int, part: OperationKind) -> OperationKind:
+    """The kind whose operand at this place, counted over all that it reads, is made by another."""
+    parts = list(kind.parts)
+    for k, inner in enumerate(parts):
+        width = 1 if inner is None else inner.operands
+        if place < width:
+            parts[k] = part if inner is None else _insert_part(inner, place, part)
+            break
+        place -= width
+    return kind._replace(parts=tuple(parts))
+
+
+# ---- groups ----------------------------------------------------------------------------------------------------------
+
+
+def _group_by_level(operations: list[ScheduledOperation], nodes: int) -> list[list[ScheduledOperation]]:
+    """Operations of one kind that wait for equally many others, and so not for each other; in order."""
+    levels, alike = [-1] * (nodes + 1), {}  # the last one is that of results that are unused
+    for operation in operations:
+        level = 1 + max([levels[i] for i in operation.operands], default=-1)
+        for i in operation.results:
+            levels[i] = level
+        alike.setdefault((level, operation.kind), []).append(operation)
+    return [alike[level_and_kind] for level_and_kind in sorted(alike)]
+
+
+# ---- slots -----------------------------------------------------------------------------------------------------------
+
+
+def _slots(
+    groups: list[list[ScheduledOperation]], outputs: dict[int, int], count: int, nodes: int
+) -> tuple[dict[int, int], int]:
+    """A slot for every result, the one that became free last first; inputs and constants have none here.
+
+    The first `count` outputs come first and keep theirs, and what is stored, from node `nodes` on, has none. Results of
+    a group get their slots before its operands give theirs back: the group may read and write in any order.
+    """
+    slots, free, size = dict(outputs), [], count
+    last = {x: g for g, group in enumerate(groups) for operation in group for x in operation.operands}
+    for g, group in enumerate(groups):
+        for x in (x for operation in group for x in operation.results if 0 <= x < nodes and x not in slots):
+            if not free:
+                free, size = [size], size + 1
+            slots[x] = free.pop()
+        done = {x for operation in group for x in operation.operands if last[x] == g and x in slots}
+        free.extend(slots[x] for x in sorted(done) if slots[x] >= count)
+    return slots, size

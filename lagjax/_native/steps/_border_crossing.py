@@ -1,0 +1,223 @@
+"""The crossing of borders, after a step that ends at one: the motion takes the piece beyond, slides, or is let go."""
+
+import functools
+from collections.abc import Container
+
+from lagjax._native.code import _constants as limits
+from lagjax._native.code._frame import Frame
+from lagjax._native.code._ir import Code, Value
+from lagjax._native.series._taylor import TaylorSeries
+from lagjax._native.steps._border_kicks import Kicks
+from lagjax._native.steps._knots import Knots
+from lagjax._native.steps._retraction import Retraction
+from lagjax._native.steps._saltation import Saltation
+from lagjax._native.steps._step import absolute_tolerance
+from lagjax._native.steps._watch import Border, Crossed, Touch, end_at_border, reaches_border
+from lagjax._program import SLIDE, Borders, Jump, Nesting, eliminate_dead_code
+
+_UNHELD = 1e6  # a share of a border that both sides do not push onto: those of others are near 0 … 1
+
+
+class BorderCrossing:
+    """The functions `cross`, and `decide`, which gives the pieces of lanes that are undecided.
+
+    With tangents (`nesting`) it has a `jump` of these. A motion that crosses has `forgotten` some fields.
+    """
+
+    def __init__(
+        self, motion: TaylorSeries, borders: Borders, knots: Knots, nesting: Nesting, jump: Jump | None, forgotten: dict
+    ):
+        self.motion, self.borders, self.table, self.knots, self.forgotten = (
+            motion,
+            borders,
+            knots.table,
+            knots,
+            forgotten,
+        )
+        self.decide = self._decide()
+        self.retraction = borders.holding.retraction and Retraction(motion, borders, nesting)
+        self.retract = self.retraction and self.retraction.apply(is_run=True)
+        self.jump: tuple[Code, Code] | None = None  # what notes it, and what applies it
+        if jump is not None:
+            saltation = Saltation(motion, self.table, nesting.base, jump)
+            motion.layout.extend_by(saltation.fields_along())
+            self.jump = saltation.note(), saltation.apply()
+        self.kicks = Kicks(motion, borders, self.table, nesting.base) if borders.kicking else None
+        self.cross = self._cross()
+
+    def _decide(self) -> Code:
+        """`()`: the pieces of the lanes that are undecided."""
+        frame = self.motion.function("decide")
+        code, undecided = frame.code, frame["undecided"] > 0.0
+        with code.only_if(code.any_lane(undecided)):
+            inputs = [*self.motion.state_inputs(frame), frame.vectors("stays", self.motion.pieces)]
+            pieces = self.motion.form.run(frame, self.borders.decide, *inputs)
+            for j in self.motion.form.each(code, self.motion.pieces):
+                frame.assign(undecided, j + self.motion.parameters, params=pieces[j])
+                frame.assign(undecided, j, stays=0.0)
+            for border in self.table.each(frame):
+                slide = border["slide"]
+                with code.only_if((slide >= 0) & code.compare("==", border.g, border["rest"])):
+                    border.remember(undecided & (self.table.piece(frame, slide) > 0.0), touch=Touch.SLIDING)
+            frame["undecided"] = 0.0
+        return frame.finish()
+
+    def _decide_again(self, frame: Frame, where: Value) -> None:
+        frame.assign(where, undecided=1)
+        frame.call(self.decide)
+
+    def _cross(self) -> Code:
+        """`()`: after the step, the pieces beyond the borders that were reached."""
+        frame = self.motion.function("cross")
+        code = frame.code
+        stepped, crosses, was_cut = frame["stepped"] > 0.0, frame["crossed"] > Crossed.NOTHING, frame["nearest"] < 1.0
+        if self.retraction is not None:  # borders that are left before the step begins do not take the state
+            has_begun = stepped | (frame["returned"] > 0.0) if self.forgotten else stepped
+            self.retraction.undo(frame, ~has_begun)
+        for border in self.table.each(frame):
+            border.remember(stepped & (border.touch < Touch.SLIDING), touch=Touch.NONE)
+        with code.only_if(code.any_lane(crosses | was_cut)):
+            # What a cut step was to be says more about the next one than what it became.
+            longest = limits.GROWTH * abs(frame["planned"])
+            frame.assign(was_cut & reaches_border(frame), longest=longest, h=frame["planned"])
+            if self.jump is not None:
+                frame.call(self.jump[0])
+            if self.borders.holding.release.outputs:
+                self._release(frame)
+            if self.kicks is not None:
+                self.kicks.note_pieces(frame)
+            self._go_on(frame, crosses)
+            if self.table.groups:
+                counts = stepped & self.table.crosses(frame, Crossed.GUARD)
+                frame["steps"] = frame["steps"] + code.select(counts, frame["more"], 0.0)
+            frame.assign(crosses, **self.forgotten)
+            if self.kicks is not None:
+                self._decide_by_velocity(frame, self.kicks.apply(frame, crosses))
+            if self.jump is not None:
+                frame.call(self.jump[1])
+            # A border at which a step of no length ends, too, whether it is crossed or only met.
+            idle = code.select(stepped, 0.0, frame["idle_crossings"] + 1.0)
+            frame.assign(stepped | crosses | was_cut, idle_crossings=idle)
+            most = float(limits.MOST_CROSSINGS * (len(self.borders.guards) + len(self.borders.clocks)))
+            frame.assign(frame["idle_crossings"] > most, code=limits.DISCONTINUOUS)
+        return frame.finish()
+
+    def _go_on(self, frame: Frame, going: Value) -> None:
+        """Go past borders and knots; the motion slides along no border that jumps there, and touches none such."""
+        shaken, code = self.borders.shaken, frame.code
+        line = eliminate_dead_code(self.borders.program.line, [self.borders.decisions[j].switch for j in shaken])
+        before = self.motion.evaluate_now(frame, line) if shaken else []
+        before = [code.variable(before[k]) for k in range(len(shaken))]
+        for border in self.table.each(frame):
+            self._take_beyond(frame, border)
+        self.knots.cross(frame, going)
+        self._decide_others(frame, going)
+        after = self.motion.evaluate_now(frame, line) if shaken else []
+        for k, j in enumerate(shaken):
+            jump = abs(after[k] - before[k].value)
+            least = abs(after[k]) * limits.ROUND_OFF + code.lanes_of(absolute_tolerance(frame))
+            self._let_go(frame, going & (jump > least), [j])
+        if shaken:
+            self._decide_others(frame, going)
+
+    def _let_go(self, frame: Frame, where: Value, pieces: Container[int]) -> None:
+        """The motion touches the borders of some pieces no more, and slides along none of them."""
+        for g, guard in enumerate(self.borders.guards):
+            if guard.piece in pieces:
+                frame.assign(where, g, touch=Touch.NONE)
+                if guard.slide >= 0:
+                    frame.assign(where, self.motion.parameters + guard.slide, params=0.0)
+
+    def _decide_others(self, frame: Frame, going: Value) -> None:
+        """Decide the pieces anew that touch no border and have left none, where one is crossed that others read."""
+        if not self.borders.nested:
+            return
+        with frame.code.loop(self.motion.pieces) as j:
+            frame["stays", j] = 0.0
+        for j in self.borders.clocks:
+            frame["stays", j] = 1.0
+        for border in self.table.each(frame):
+            frame.assign(frame.code.compare("!=", border.touch, float(Touch.NONE)), border["piece"], stays=1)
+        self._decide_again(frame, going)
+
+    def _take_beyond(self, frame: Frame, border: Border) -> None:
+        """Take the piece beyond a border, which touches it; a piece that touches one is not decided anew.
+
+        A motion that would go back over the border at once is pushed onto it from both sides: it slides. So does one
+        that has come back in no measurable time, or not to rounding: it bounces off the border, ever less, and rests.
+        """
+        code, hit, again, beyond = frame.code, border.is_hit, frame["stepped"] <= 0.0, frame["beyond"]
+        if self.table.groups:
+            is_first = self.table.crosses(frame, Crossed.GUARD, border.g)
+            beyond = code.select(is_first, beyond, border.rule("beyond")(border.piece))
+        no_time = ~again & (abs(end_at_border(frame)) <= limits.NO_TIME * frame["smallest"])
+        no_time = (no_time | (~again & (frame["stops"] > 0.0))) & (frame["at_rest"] > 0.0)
+        place, back, slide = border["piece"] + self.motion.parameters, border["back"], border["slide"]
+        bounces = no_time & border.has("order", 2)  # by position
+        slides = bounces | (again & (border.touch > Touch.NONE))
+        if self.borders.releases:
+            slides = slides | border.is_cone
+        slides = hit & slides & border.has("slide")
+        frame.assign(hit & ~slides, place, params=beyond)
+        # A share jumps to where it is: it need not touch the border that it had crossed before.
+        frame.assign(hit, back, touch=code.select(border.has("on"), Touch.NONE, Touch.VALUE))
+        with code.only_if(slide >= 0):
+            below = code.select(border.piece < beyond, border.piece, beyond)
+            frame.assign(slides, place, params=code.select(border.is_sign, -1.0, below))
+            frame.assign(slides, slide + self.motion.parameters, params=1)
+            for g, touch in ((border.g, Touch.NONE), (back, Touch.NONE), (border["rest"], Touch.SLIDING)):
+                frame.assign(slides, g, touch=touch)
+        self._leave(frame, border, hit, again)
+
+    def _leave(self, frame: Frame, border: Border, hit: Value, again: Value) -> None:
+        """Let a sliding motion continue on one side, when its share of that side reaches 0 or 1.
+
+        The rate of u that was kept at zero is zero there after a slide, and not where it did not slide at all. Where
+        both sides do not push onto the border, it continues as the function is written at the border itself.
+        """
+        code, on = frame.code, Border(frame, self.table, border["on"])
+        with code.only_if(on.g >= 0):
+            order = code.lanes_of(code.as_double(on["order"]))
+            gains = code.as_double(border["gains"])
+            share, below, level = self.motion.followed_value(frame, border["piece"]), on.piece, on.rule("level")
+            unheld = hit & (abs(share) > _UNHELD) & ~on.is_cone
+            toward_zero = (code.lanes_of(abs(level.below) + abs(level.above)) > 0.0) & (below < 0.0)
+            as_written = code.select(on.is_sign, 0.0, below + code.select(toward_zero, 0.0, 1.0))
+            place = on["piece"] + self.motion.parameters
+            frame.assign(hit, place, params=code.select(unheld, as_written, below + gains))
+            frame.assign(hit, border["rest"], touch=Touch.NONE)
+            on.remember(hit, touch=code.select(again, order, order + Touch.VALUE))
+            on.remember(unheld, touch=Touch.CONTINUES)
+            if self.borders.releases:  # the vector of a cone has been given a length beyond its level
+                on.remember(hit & on.is_cone, touch=Touch.NONE)
+
+    def _release(self, frame: Frame) -> None:
+        """Let the vectors of cones that hold no longer set out, with a speed that is twice what counts as none."""
+        code, motion, n = frame.code, self.motion, len(self.borders.holding.release.outputs)
+        shares = self.borders.releases
+        hits = [self.table.crosses(frame, Crossed.GUARD, g) for g in shares]
+        base = n // (2 * len(shares))
+        with code.only_if(code.any_lane(functools.reduce(Value.__or__, hits))):
+            out = motion.evaluate_now(frame, self.borders.holding.release)
+            speed = code.lanes_of(2.0 * limits.SETS_OUT * absolute_tolerance(frame))
+            for k, hit in enumerate(hits):
+                for i in range(base):
+                    places = 2 * k * base + i, (2 * k + 1) * base + i
+                    if any(self.borders.holding.release.constant(place) != 0.0 for place in places):
+                        y = frame["y", i + motion.n, 0] + (speed * out[places[0]] - out[places[1]])
+                        frame.assign(hit, i + motion.n, 0, y=y)
+                        frame.assign(hit, i + motion.n, low=0.0)
+
+    def _decide_by_velocity(self, frame: Frame, kicked: Value) -> None:
+        """Decide the pieces anew whose switching numbers depend on velocities, which have been kicked."""
+        velocities = range(self.motion.n, self.motion.states)
+        by_velocity = [
+            j
+            for j, node in enumerate(self.borders.switches)
+            if self.borders.decisions[j].kind != SLIDE and not self.borders.read_by(node).isdisjoint(velocities)
+        ]
+        if by_velocity:
+            for j in range(self.motion.pieces):
+                frame.assign(kicked, j, stays=0.0 if j in by_velocity else 1.0)
+            self._let_go(frame, kicked, by_velocity)
+            self._decide_again(frame, kicked)
