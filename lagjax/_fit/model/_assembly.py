@@ -133,7 +133,7 @@ def _read_layout(system: Scene, records: list[Record], params0, form: InputForm 
     q, qdot = jax.tree.map(jnp.asarray, begun)
     scene, params = first_law(system), params0
     if form is not None:
-        scene, params = form.drive_scene(scene), form.params(params0, 2)
+        scene, params = form.drive_system(scene), form.params(params0, 2)
     try:
         jax.eval_shape(lambda q, qdot: scene.energy(q, qdot, 0.0, params), q, qdot)
     except Exception as reason:

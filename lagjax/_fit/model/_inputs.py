@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._run.hybrid import Hybrid, Scene, Transition, laws
-from lagjax._scene import MARGINS, Driven, asking_for_inputs, continued, drive_function, drive_scene, samples
+from lagjax._scene import MARGINS, Driven, System, asking_for_inputs, continued, drive_function, drive_scene, samples
 
 PyTree = Any
 _LEAST_ROOM, _GROWTH = 16, 4  # of tables: at most four times what is needed, and six programs up to 16 000 samples
@@ -57,10 +57,11 @@ class InputForm(NamedTuple):
         """The inputs at the time t, by the table of one piece."""
         return self.restore(samples(table.knots, table.values, self.hold)(t))
 
+    def drive_system(self, system: System) -> System:
+        return drive_scene(system, self, ("t", "params"))
+
     def drive_scene(self, scene: Scene) -> Scene:
-        if isinstance(scene, Hybrid):
-            return _drive_modes(scene, self)
-        return drive_scene(scene, self, ("t", "params"))
+        return _drive_modes(scene, self) if isinstance(scene, Hybrid) else self.drive_system(scene)
 
     def bind_samples(self, system: Scene, params: PyTree, ts: np.ndarray, inputs: np.ndarray) -> tuple[Scene, PyTree]:
         """The scene with inputs (K, I) sampled at `ts` (K,), and its parameters, as `simulate` takes them."""
@@ -77,7 +78,7 @@ class InputForm(NamedTuple):
 @functools.lru_cache(maxsize=16)
 def _drive_modes(scene: Hybrid, form: InputForm) -> Hybrid:
     drive = functools.partial(drive_function, find_inputs=form, extras=("t", "params"))
-    modes = {name: form.drive_scene(mode) for name, mode in scene.modes.items()}
+    modes = {name: form.drive_system(mode) for name, mode in scene.modes.items()}
     transitions = [
         Transition(one.source, one.target, drive(one.guard), one.direction, one.reset and drive(one.reset), one.fires)
         for one in scene.transitions

@@ -157,7 +157,8 @@ class _JaxMotions(AbstractMotions):
 @functools.lru_cache(maxsize=16)
 def _programs_once(scene: Scene, layout: Layout, tree, leaves: tuple, options: tuple, is_driven: bool):
     """The motions with their tangents and the accelerations of many rows: compiled once for the fits of a scene."""
-    restore = Parameters([np.zeros(*leaf) for leaf in leaves], tree, *np.zeros((3, 0)), (), ()).restore
+    none = np.zeros(0)
+    restore = Parameters([np.zeros(*leaf) for leaf in leaves], tree, none, none, none, (), ()).restore
 
     def scene_params(numbers, table):
         params = restore(numbers)
@@ -224,7 +225,7 @@ class Manifold:
         form: InputForm | None = None,
     ):  # fmt: skip
         """`form` is that of the inputs of a scene that asks for them, but not in its constraints."""
-        scene = system if form is None else form.drive_scene(system)
+        scene = system if form is None else form.drive_system(system)
 
         def project(y: jax.Array, t, numbers, table) -> jax.Array:
             q, qdot = map(layout.restore, halves(y))

@@ -395,7 +395,7 @@ class Unknowns(NamedTuple):
     def norms(self, lengths: np.ndarray) -> np.ndarray:
         """The lengths (F,) of the columns of all unknowns from those of records (R, L), also where squares are no
         numbers."""
-        largest, total = np.zeros((2, self.count + 1))
+        largest, total = np.zeros(self.count + 1), np.zeros(self.count + 1)
         np.maximum.at(largest, self.columns, lengths)
         unit = np.where(largest > 0, largest, 1.0)
         np.add.at(total, self.columns, (lengths / unit[self.columns]) ** 2)
