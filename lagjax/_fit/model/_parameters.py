@@ -380,9 +380,9 @@ class Unknowns(NamedTuple):
 
     def spread(self, local: np.ndarray) -> np.ndarray:
         """Rows (R, ..., L) of columns of records as rows (R, ..., F) of columns of all unknowns."""
-        found = np.zeros((*local.shape[:-1], self.count + 1))
-        for own, columns, row in zip(found, self.columns, local, strict=True):
-            own[..., columns] = row
+        found: np.ndarray = np.zeros((*local.shape[:-1], self.count + 1))
+        for k, columns in enumerate(self.columns):
+            found[k][..., columns] = local[k]
         return found[..., :-1]
 
     def add(self, squares: np.ndarray) -> np.ndarray:
