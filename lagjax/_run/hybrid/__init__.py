@@ -32,13 +32,7 @@ from lagjax._interface import (
     require_flag,
     result_from,
 )
-from lagjax._run._trajectory import (
-    Trajectory,
-    follow_in_doubles,
-    follow_in_numbers,
-    raise_unless_ok,
-    step_counts,
-)
+from lagjax._run._trajectory import Trajectory, follow_in_doubles, follow_in_numbers, raise_unless_ok, step_counts
 from lagjax._run.hybrid._mode import Transition
 from lagjax._run.hybrid._transition_motion import HybridPlan, follow_known, hybrid_motion
 from lagjax._run.hybrid._transition_search import IN_ONE_PLACE

@@ -292,15 +292,8 @@ class _Run:
         given = scene, memory, ts, *of_member, np.ascontiguousarray(done.path[0]), np.ascontiguousarray(done.y_end[0])
         result, fell = SUCCESSFUL if happened else int(done.result[0]), done.event[0].astype(float)
         steps = float(done.accepted[0]), float(done.rejected[0])
-        loops[2](
-            *(x.ctypes.data for x in given),
-            float(done.t_end[0]),
-            fell.ctypes.data,
-            int(happened),
-            result,
-            *steps,
-            work.ctypes.data,
-        )
+        addresses = [x.ctypes.data for x in given]
+        loops[2](*addresses, float(done.t_end[0]), fell.ctypes.data, int(happened), result, *steps, work.ctypes.data)
 
 
 # ---- as a primitive --------------------------------------------------------------------------------------------------
