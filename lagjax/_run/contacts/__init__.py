@@ -23,9 +23,11 @@ from lagjax._engine.taylor import MachineCode, line_of
 from lagjax._equations import ROUNDINGS, derivation_of, has_constraints, require_consistent
 from lagjax._interface import Layout, compile_for_one_call, halves, require_budget, result_from
 from lagjax._run._trajectory import (
+    EACH,
     ContactChanges,
     Impacts,
     Names,
+    RunSettings,
     State,
     Trajectory,
     follow_in_doubles,
@@ -62,7 +64,7 @@ def follow_contacts(given: Problem, problem: Problem, max_transitions: int | Non
 
 
 def _follow(plan: ContactPlan, problem: Problem) -> Trajectory:
-    return _trajectory(problem, problem, *_motion(plan, problem), None)
+    return _trajectory(problem, problem, *_motion(plan, problem), None, plan.max_transitions)
 
 
 _follow_compiled = compile_for_one_call(_follow)  # outside of `jit` one program, and not one an operation
@@ -76,13 +78,13 @@ def _put_on_device(trajectory: Trajectory) -> Trajectory:
 
 def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int | None, params, params_axes) -> Trajectory:
     """The motions of a batch whose system has contacts."""
-    plan, *_ = _plan(batch.member, max_transitions)
+    plan, *_ = _plan(batch.whole, max_transitions)
     if batch.is_known:
-        found = follow_rows(functools.partial(follow_known, plan), batch.member, batch.y0, batch.vectors)
+        found = follow_rows(functools.partial(follow_known, plan), batch.member, batch.ts, batch.y0, batch.vectors)
     else:
         found = batch.map_members(lambda problem: follow_in_doubles(functools.partial(contact_motion, plan), problem))
     ending, record, impacts = found
-    trajectory = _trajectory(given.member, batch.member, ending, record, impacts, None, params_axes)
+    trajectory = _trajectory(given.whole, batch.whole, ending, record, impacts, None, plan.max_transitions, params_axes)
     return dataclasses.replace(_put_on_device(trajectory), params=params)
 
 
@@ -178,18 +180,26 @@ def _require_open(problem: Problem, closed: Problem, free: Problem) -> None:
 
 
 def _trajectory(
-    given: Problem, problem: Problem, ending: ContactEnding, record: RoundRecord, impacts, params, axes=None
+    given: Problem,
+    problem: Problem,
+    ending: ContactEnding,
+    record: RoundRecord,
+    impacts,
+    params,
+    budget: int,
+    axes=EACH,
 ) -> Trajectory:
     restore = problem.layout.restore
     (q, qdot), end, (at, behind) = (tuple(map(restore, halves(y))) for y in (ending.path, ending.y, record.y_next))
     before = restore(record.qdot)
     known = record.contact, record.change, ending.rounds, ending.doubts, ending.doubted, record.impulse
     names = Shapes.from_system(problem.system, problem.layout, problem.params).names
+    settings = RunSettings.from_problem(given, MachineCode(), max_transitions=budget)
     changes = ContactChanges(record.t, at, before, at, behind, *known, Names(names))
     return Trajectory(
         ts=jnp.asarray(given.ts), q=q, qdot=qdot, result=result_from(ending.result), end=State(ending.t, *end),
         stats=step_counts(*ending.steps), system=given.system, params=params, params_axes=axes,
-        tolerances=MachineCode().tolerances(problem, problem.y0), engine="MachineCode", impacts=Impacts(*impacts),
+        tolerances=MachineCode().tolerances(problem, problem.y0), settings=settings, impacts=Impacts(*impacts),
         contacts=ending.of_path, contact_changes=changes, contact_names=names,
     )  # fmt: skip
 

@@ -101,11 +101,12 @@ def contact_motion(
 
 
 def follow_known(plan: ContactPlan, layout: Layout, params: PyTree, ts, y0, vectors) -> tuple:
-    """The motions of members whose numbers are known, with members in front: `y0` (N, 2n), `vectors` (N or 1, P).
+    """The motions of members whose numbers are known, with members in front: `y0` (N, 2n), `ts` (N or 1, T), `vectors`
+    (N or 1, P).
 
     `params` are those of one member. There is room for as many changes as there were.
     """
-    scene, members = scene_of(plan, layout, params, len(ts)), len(y0)
+    scene, members = scene_of(plan, layout, params, ts.shape[1]), len(y0)
     vectors = np.broadcast_to(np.asarray(vectors, float), (members, np.shape(vectors)[-1]))
     if scene.coefficients is None:
         rows = [_coefficients_at(scene.flat, params, vector) for vector in vectors]
@@ -113,7 +114,7 @@ def follow_known(plan: ContactPlan, layout: Layout, params: PyTree, ts, y0, vect
     else:
         values = [np.broadcast_to(x, members) for x in scene.coefficients.evaluate_many(list(vectors.T))]
         coefficients = np.split(np.stack(values, axis=-1), [scene.flat.shapes.count], axis=1)
-    code, given = scene.replay.code, (np.asarray(ts, float)[None], np.asarray(y0, float), vectors)
+    code, given = scene.replay.code, (np.asarray(ts, float), np.asarray(y0, float), vectors)
     found = code.run(*given, *coefficients, room=None)
     return _arrange(scene, found, *scene.replay.read(found), ())
 

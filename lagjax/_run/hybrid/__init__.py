@@ -32,7 +32,14 @@ from lagjax._interface import (
     require_flag,
     result_from,
 )
-from lagjax._run._trajectory import Trajectory, follow_in_doubles, follow_in_numbers, raise_unless_ok, step_counts
+from lagjax._run._trajectory import (
+    RunSettings,
+    Trajectory,
+    follow_in_doubles,
+    follow_in_numbers,
+    raise_unless_ok,
+    step_counts,
+)
 from lagjax._run.hybrid._mode import Transition
 from lagjax._run.hybrid._transition_motion import HybridPlan, follow_known, hybrid_motion
 from lagjax._run.hybrid._transition_search import IN_ONE_PLACE
@@ -148,11 +155,13 @@ def follow_modes(
     else:
         found = follow_in_doubles(functools.partial(hybrid_motion, plan), problem, start)
     known = dataclasses.replace(problem, ts=jax.lax.stop_gradient(problem.ts))
+    more = {"max_transitions": scene.max_transitions, "transitions": tuple(scene.transitions)}
     trajectory = Trajectory(
         ts=jnp.asarray(problem.ts), q=found.path[0], qdot=found.path[1], result=result_from(found.result),
         end=found.end, stats=step_counts(*found.steps), system=dict(modes), params=problem.params, mode=found.modes,
         transitions=found.transitions, mode_names=tuple(modes),
         tolerances=MachineCode().tolerances(known, jax.lax.stop_gradient(problem.y0)),
+        settings=RunSettings.from_problem(problem, MachineCode(), **more),
     )  # fmt: skip
     return _raise_unless_ok(modes, trajectory, layout, found.mode) if throw else trajectory
 

@@ -62,12 +62,13 @@ def hybrid_motion(plan: HybridPlan, layout: Layout, ts, y0, params: PyTree, star
 
 
 def follow_known(plan: HybridPlan, layout: Layout, params: PyTree, ts, y0, vectors, start) -> Ending:
-    """The motions of members whose numbers are known, with members in front: `y0` (N, 2n), `vectors` (N, P).
+    """The motions of members whose numbers are known, with members in front: `y0` (N, 2n), `ts` (N or 1, T),
+    `vectors` (N, P).
 
     `params` are those of one member; all begin in the mode of place `start`.
     """
-    replay, starts = replay_of(plan, layout, params, len(ts)), np.full((len(y0), 1), float(start))
-    given = (np.asarray(x, float) for x in (ts[None], y0, vectors))
+    replay, starts = replay_of(plan, layout, params, ts.shape[1]), np.full((len(y0), 1), float(start))
+    given = (np.asarray(x, float) for x in (ts, y0, vectors))
     found = replay.code.run(*given, starts, room=plan.max_transitions + 1)
     return _arrange(plan, layout, replay, found, *replay.read(found), ())
 

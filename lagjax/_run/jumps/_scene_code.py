@@ -20,7 +20,7 @@ from jax.interpreters import mlir
 from lagjax._engine import Problem
 from lagjax._engine.taylor import Line, MachineCode, Surfaces, Tolerances, line_of, rate_errors
 from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL, is_concrete
-from lagjax._native import LARGEST_LINE, SINGLE_NOISE, LineCode, Loop, compile_loops, cores, handler
+from lagjax._native import LARGEST_LINE, SINGLE_NOISE, LineCode, Loop, compile_loops, cores, handler, line_function
 from lagjax._primitives import LinearMap, call_host, compute_on_host
 from lagjax._run.jumps._driver import ASKS, GOING, NEW
 from lagjax._run.jumps._field_places import Places
@@ -37,7 +37,7 @@ def tolerances_of(problem: Problem, scene: str, what: str) -> Tolerances:
     """
     if not all(map(is_concrete, problem.tolerances)):
         raise ValueError(f"rtol and atol of {scene} must be numbers: they decide the order of the method.")
-    if is_concrete(problem.ts) and np.asarray(problem.ts)[-1] < np.asarray(problem.ts)[0]:
+    if is_concrete(problem.ts) and (np.asarray(problem.ts)[..., -1] < np.asarray(problem.ts)[..., 0]).any():
         raise ValueError(f"The motion of {scene} goes forward in time: {what} cannot be undone; ts must increase.")
     wide = problem.double_precision if problem.is_single else problem
     return Tolerances(float(MachineCode().rtol(wide)), float(problem.tolerances[1] or 0.0), problem.max_steps)
@@ -93,7 +93,7 @@ class SceneCode:
         self.law, self.modes, self.lines, self.tolerances, self._first = law, modes, lines, tolerances, first
         counts = np.array([mode.count for mode in modes])
         self.sizes = sizes | {"MODES": len(modes), "WATCHES": int(counts.max())}
-        empty = dict.fromkeys(("WATCH", "ERRORS", "SLOPES"), np.zeros(len(modes)))
+        empty: dict = dict.fromkeys(("WATCH", "ERRORS", "SLOPES"), np.zeros(len(modes)))
         empty["PLANS"] = np.zeros(2 * len(modes))
         self.arrays, self.fields = {"COUNTS": counts, **empty, **arrays}, law.places.count_doubles(self.sizes)
         self._keep = []  # what the addresses point to
@@ -201,14 +201,14 @@ class SceneCode:
 def _call_numpy(line: Line) -> tuple[Any, int]:
     """A function that evaluates a line by NumPy, called as machine code is, and its address: for tables."""
 
-    def evaluate(x: int, out: int, _rows: int) -> None:
+    def evaluate(x: int, out: int, *_: int) -> None:
         given, found = (
             np.ctypeslib.as_array((ctypes.c_double * size).from_address(place))
             for place, size in ((x, line.size), (out, line.outputs))
         )
         found[:] = line.line.evaluate(list(given[:, None]))[:, 0]
 
-    function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(evaluate)
+    function = line_function(evaluate)
     address = ctypes.cast(function, ctypes.c_void_p).value
     assert address is not None
     return function, address
