@@ -37,13 +37,14 @@ PyTree = Any
 def find_states(run: Trajectory, t) -> State:
     """The states at times t, whose axes come behind those of the batch (see `Trajectory.at`)."""
     settings, batch = _require_settings(run), jnp.shape(run.result._value)
+    run._require_present()
     times, shape = _spread_times(run, t, batch)
     places = Places.from_trajectory(run, times, batch)
     library: Any = np if all(map(is_concrete, jax.tree.leaves((run, times)))) else jnp
     own = lambda x: library.asarray(x).reshape(-1, *jnp.shape(x)[len(batch) :])  # noqa: E731
     flat = jax.tree.map(own, (run.q, run.qdot, run.mode))
     states = times, *_states_at_places(run, settings, places, flat)
-    states = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[2:]), states)
+    states = jax.tree.map(lambda x: x.reshape((*shape, *x.shape[2:])), states)
     return State(*(jax.device_put(states) if library is np else states))
 
 
@@ -152,7 +153,7 @@ def _follow_lanes(run: Trajectory, settings: "RunSettings", ts, member: np.ndarr
     """
     (q, qdot, mode), (params, axes) = state, spread_params(run, member)
     tolerances = settings.tolerances or run.tolerances
-    if any(jnp.ndim(x) for x in tolerances or ()):
+    if any(x is not None and jnp.ndim(x) for x in tolerances or ()):
         raise ValueError("Its members have tolerances of their own: ask each of them for states between its outputs.")
     rtol, atol = tolerances or (None, None)
     if isinstance(run.system, dict):
@@ -201,7 +202,7 @@ def _spread_times(run: Trajectory, t, batch: tuple[int, ...]) -> tuple[Any, tupl
     except ValueError:
         raise ValueError(
             f"t has shape {t.shape}, and the batch {batch}: give a number or times (K,) for all members, or for each "
-            f"its own, which broadcast with {(*batch, 'K')}: (…, 1) for one time each."
+            f"its own, which broadcast with ({', '.join(map(str, batch))}, K): K = 1 for one time each."
         ) from None
     return times.reshape(-1, t.shape[-1]), shape
 

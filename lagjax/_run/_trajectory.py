@@ -314,7 +314,6 @@ class Trajectory(eqx.Module):
         assert abs(run.at(2.5).q - jnp.cos(2.5)) < 1e-6
         ```
         """
-        self._require_present()
         return registered().find_states(self, t)
 
     def energy(self) -> jax.Array:
