@@ -175,7 +175,7 @@ class ContactChanges(NamedTuple):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True, eq=False)
 class RunSettings:
-    """How a motion was integrated: what another run of its scene needs. Equal to one with equal values.
+    """The engine of a motion and its options, which another run of its scene needs. Equal to one with equal values.
 
     - `engine`: what integrated it; None where numbers of its solver were being traced.
     - `tolerances`: rtol and atol as they were given; None where they were being traced.
@@ -266,7 +266,7 @@ class Trajectory(eqx.Module):
         def __getattr__(self, name: str):
             text = f"A Trajectory has no attribute {name!r}."
             if name in ("t", "y", "ys", "sol"):
-                text += " Its times are `ts`, its states `q` and `qdot`; for states at more times give them in ts."
+                text += " Its times are `ts`, its states `q` and `qdot`; `at(t)` gives states at other times."
             raise AttributeError(text)
 
     def __repr__(self) -> str:
