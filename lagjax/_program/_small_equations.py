@@ -8,14 +8,14 @@ import scipy
 
 from lagjax._program._graph import Graph
 
-# Borders that are not independent share what they hold as if they yielded by so much, relative; what that leaves is
-# mended this many times. The share of what no border holds alone is as exact as rounding, divided by it.
+# Borders that are not independent share what they hold as if they yielded by `SOFT`, relative; the remaining error is
+# corrected `MENDED` times. The share of what no border holds alone is as exact as rounding, divided by it.
 SOFT, MENDED = 1e-9, 2
 
 Sparse = dict[int, int]  # the nodes of a vector by their place in it; what is not there is zero
 
 
-class Equations(NamedTuple):
+class Eliminated(NamedTuple):
     """Linear equations after `eliminate`, and as they are where they are solved softly (`SOFT`)."""
 
     factors: list[Sparse]

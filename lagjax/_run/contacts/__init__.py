@@ -21,7 +21,7 @@ import numpy as np
 from lagjax._engine import Batch, Problem
 from lagjax._engine.taylor import MachineCode, line_of
 from lagjax._equations import ROUNDINGS, derivation_of, has_constraints, require_consistent
-from lagjax._interface import Layout, compile_for_one_call, halves, is_concrete, require_budget, result_from
+from lagjax._interface import Layout, compile_for_one_call, halves, require_budget, result_from
 from lagjax._run._trajectory import (
     EACH,
     ContactChanges,
@@ -46,6 +46,7 @@ from lagjax._run.contacts._contact_motion import (
     slots_of,
 )
 from lagjax._run.contacts._contact_search import find_start_width
+from lagjax._run.jumps import tolerances_of
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes, System, require_coefficients
 
 CHANGES = 1024  # the budget of changes of a motion whose crossings are asked for; what they record takes memory
@@ -117,14 +118,8 @@ def _plan(problem: Problem, max_transitions: int | None) -> tuple[ContactPlan, P
     """
     max_transitions = 256 if max_transitions is None else max_transitions
     require_budget(max_transitions, "max_transitions")
-    if not all(map(is_concrete, problem.tolerances)):
-        raise ValueError("rtol and atol of a scene with contacts must be numbers: they decide the order of the method.")
-    if is_concrete(problem.ts) and (np.asarray(problem.ts)[..., -1] < np.asarray(problem.ts)[..., 0]).any():
-        raise ValueError("A scene with contacts goes forward in time: an impact cannot be undone; ts must increase.")
+    tolerances, scene = tolerances_of(problem, "a scene with contacts", "an impact"), ContactScene(problem.system)
     wide = problem.double_precision if problem.is_single else problem
-    rtol, atol = float(MachineCode().rtol(wide)), problem.tolerances[1]
-    limits = rtol, None if atol is None else float(atol), problem.max_steps, max_transitions, problem.is_single
-    scene = ContactScene(problem.system)
     with jax.enable_x64(True):
         shapes = Shapes.from_system(problem.system, wide.layout, wide.params)
         r, d = shapes.rough.size, shapes.directions
@@ -144,7 +139,7 @@ def _plan(problem: Problem, max_transitions: int | None) -> tuple[ContactPlan, P
             holds = Problem.from_system(scene, wide.layout, inside)
         if refusal := MachineCode().refuses(free) or holds.derivation.lowered.accelerations.lacks:
             raise ValueError(f"A scene with contacts needs machine code, and has none: {refusal}.")
-        plan, lowered = ContactPlan(scene, *limits), closed.derivation.lowered
+        plan, lowered = ContactPlan(scene, tolerances, max_transitions, problem.is_single), closed.derivation.lowered
         rows = RowPlaces.from_derivation(lowered, flat).normal[shapes.of_gaps :]
         stays = [not moves.any() for moves in ~lowered.absent("jacobian")[rows]]
         for name, still in zip(shapes.names[shapes.of_gaps :], stays, strict=True):
@@ -215,7 +210,7 @@ def _trajectory(
 def contact_forces(trajectory: Trajectory, name: str):
     """At every output the `multipliers` of constraints, `constraint_force`, or the normal `contact_forces`, by name.
 
-    NaN where the motion did not come to.
+    NaN where the motion did not arrive.
     """
     system = trajectory.system
     assert isinstance(system, System)
