@@ -156,11 +156,12 @@ def _follow_lanes(run: Trajectory, settings: "RunSettings", ts, member: np.ndarr
     if any(x is not None and jnp.ndim(x) for x in tolerances or ()):
         raise ValueError("Its members have tolerances of their own: ask each of them for states between its outputs.")
     rtol, atol = tolerances or (None, None)
+    engine: Any = settings.engine
     if isinstance(run.system, dict):
         modes = {name: run.system[name] for name in run.mode_names}
 
         def follow(q, qdot, ts, start, params):
-            scene = Hybrid(modes, list(settings.transitions), start, settings.max_transitions)
+            scene = Hybrid(modes, list(settings.transitions), start, settings.max_transitions or 0)
             return follow_modes(scene, q, qdot, ts, params, rtol, atol, settings.max_steps, False)
 
         done = jax.vmap(follow, (0, 0, 0, 0, axes))(q, qdot, jnp.asarray(ts), mode, params)
@@ -174,7 +175,7 @@ def _follow_lanes(run: Trajectory, settings: "RunSettings", ts, member: np.ndarr
             done = follow_contacts_batch(given, batch, settings.max_transitions, params, axes)
             result, q, qdot = done.result._value, done.q, done.qdot
         else:
-            done = settings.engine.solve_batch(batch)
+            done = engine.solve_batch(batch)
             result, (q, qdot) = done.result, map(batch.member.layout.restore, halves(done.path))
     if is_concrete(result) and not np.isin(result, ENDED_WELL).all():
         lane = int(np.flatnonzero(~np.isin(result, ENDED_WELL))[0])

@@ -191,9 +191,9 @@ class RunSettings:
     @classmethod
     def from_problem(cls, problem: Problem, engine: AbstractEngine, **more: Any) -> "RunSettings":
         known = all(map(is_concrete, jax.tree.leaves(engine)))
-        numbers = problem.tolerances if all(map(is_concrete, problem.tolerances)) else None
-        tolerances = numbers and tuple(None if x is None else float(x) for x in numbers)
-        return cls(engine if known else None, tolerances, problem.max_steps, **more)
+        rtol, atol = (x if x is None or not is_concrete(x) else float(x) for x in problem.tolerances)
+        given = (rtol, atol) if is_concrete(rtol) and is_concrete(atol) else None
+        return cls(engine if known else None, given, problem.max_steps, **more)
 
     @functools.cached_property
     def _key(self) -> tuple:
