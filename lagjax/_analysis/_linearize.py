@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax._analysis._closed_contacts import hold_closed
+from lagjax._analysis._closed_contacts import hold_closed, one_sided_reason
 from lagjax._analysis._eigen import tangent_basis
 from lagjax._analysis._equilibrium import least_multipliers
 from lagjax._analysis._scene_state import SceneState, require_matrices
@@ -235,7 +235,7 @@ def linearize(
         inputs = _require_inputs(system, sensor, inputs)
         system, params = drive_scene(system, held_inputs), Driven(params, inputs)
     if held := hold_closed(system, q, qdot, params, "A linearization"):
-        system, q = held.system, held.require_loaded(q, qdot, params, "A motion")
+        system, q = held.system, held.require_loaded(q, qdot, params, one_sided_reason("A motion"))
     scene = SceneState.from_state(system, q, qdot, params)
     scene.require_autonomous("A linearization")
     require_smooth(scene, "A linearization")
@@ -305,49 +305,39 @@ def _driven_params(of_inputs: Layout | None, scene: SceneState, u: Vector) -> Py
 @compile_for_one_call
 def _linearize(of_inputs: Layout | None, sensor: Function | None, *arguments) -> tuple:
     scene = SceneState.from_arguments(*arguments)
-    n, dtype = scene.layout.size, scene.q.dtype
-    u = jnp.zeros(n, dtype) if of_inputs is None else of_inputs.flatten(scene.params.inputs)
-
-    def state_at(q, qdot, u):
-        numbers = eqx.filter(_driven_params(of_inputs, scene, u), eqx.is_array_like)
-        return q, qdot, jnp.zeros((), dtype), numbers
-
-    mass, responses, forces, jacobian, allowed = _responses(scene, state_at, u, of_inputs is not None)
-    by_q, by_qdot, pushes = (nan_unless(is_smooth(scene), x) for x in responses)
-    stiffness, rates = (-nan_unless(is_smooth(scene), x) for x in forces)
-    a = jnp.block([[jnp.zeros((n, n), dtype), jnp.eye(n, dtype=dtype)], [by_q, by_qdot]])
-    b = jnp.concatenate([jnp.zeros_like(pushes), pushes])
-    matrices = a, b, mass, 0.5 * (rates + rates.T), 0.5 * (rates - rates.T), stiffness, jacobian
-    return matrices, (*_output_matrices(of_inputs, sensor, scene, u), allowed)
-
-
-def _responses(scene: SceneState, state_at: Callable, u: Vector, driven: bool) -> tuple:
-    """M, the derivatives of q̈ by q, q̇ and u, those of the forces by q and q̇ at fixed q̈ and λ, J, and the rows of
-    what constraints allow. u are the inputs, or generalised forces of a scene that is not `driven`."""
-    motion, n, given = scene.motion, scene.layout.size, (scene.q, scene.qdot, u)
-    varying, state = (0, 1, 2) if driven else (0, 1), state_at(*given)
-    mass, force = motion.mass_matrix_and_force(*state)
-    one, constraints = jnp.eye(n, dtype=u.dtype), motion.constraints
-    if not scene.constrained:
-        by_q, by_qdot, *by_u = jax.jacfwd(lambda *x: motion.acceleration(*state_at(*x)), varying)(*given)
-        pushes = by_u[0] if driven else factorize(mass).solve_columns(one)
-        return mass, (by_q, by_qdot, pushes), (mass @ by_q, mass @ by_qdot), one[:0], jnp.zeros((0, 2 * n), u.dtype)
+    n, state = scene.layout.size, (scene.q, scene.qdot, jnp.zeros((), scene.q.dtype), scene.numbers)
+    zero, one = jnp.zeros((n, n), scene.q.dtype), jnp.eye(n, dtype=scene.q.dtype)
+    unbalanced, constraints = scene.motion.unbalanced_force, scene.motion.constraints
+    force, mass = jax.linearize(lambda a: -unbalanced(*state[:2], a, *state[2:]), zero[0])
+    mass = -jax.vmap(mass, out_axes=1)(one)
     jacobian, gamma = constraints.jacobian(*state), constraints.gamma(*state)
-    acceleration, multipliers, _ = saddle(mass, force, jacobian, gamma)
+    if scene.constrained:
+        solve = jax.vmap(lambda b, c: saddle(mass, b, jacobian, c)[0], in_axes=1, out_axes=1)
+        acceleration, multipliers, _ = saddle(mass, force, jacobian, gamma)
+    else:
+        inverse = factorize(mass)
+        acceleration, multipliers = inverse.solve(force), gamma
 
-    def balance(*given):
+        def solve(b, c):
+            return inverse.solve_columns(b)
+
+    def balance(q, qdot, u):
         """F + Gᵀλ − M q̈ and γ − G q̈ at fixed q̈ and λ; the constraints and their rates."""
-        state = state_at(*given)
-        mass, force = motion.mass_matrix_and_force(*state)
-        jacobian, gamma = constraints.jacobian(*state), constraints.gamma(*state)
-        allowed = jnp.concatenate([constraints.f(given[0], *state[2:]), constraints.rates(*state)])
-        return force + jacobian.T @ multipliers - mass @ acceleration, gamma - jacobian @ acceleration, allowed
+        place = q, qdot, state[2], eqx.filter(_driven_params(of_inputs, scene, u), eqx.is_array_like)
+        jacobian, gamma = constraints.jacobian(*place), constraints.gamma(*place)
+        allowed = jnp.concatenate([constraints.f(q, *place[2:]), constraints.rates(*place)])
+        force = unbalanced(q, qdot, acceleration, *place[2:])
+        return jacobian.T @ multipliers - force, gamma - jacobian @ acceleration, allowed
 
-    forces, rows, allowed = jax.jacfwd(balance, varying)(*given)
-    if not driven:
-        forces, rows = (*forces, one), (*rows, jnp.zeros((len(gamma), n), u.dtype))
-    solve = jax.vmap(lambda b, c: saddle(mass, b, jacobian, c)[0], in_axes=1, out_axes=1)
-    return mass, tuple(map(solve, forces, rows)), forces[:2], jacobian, jnp.hstack(allowed[:2])
+    smooth, of_state = is_smooth(scene), (0, 1) if of_inputs is None else (0, 1, 2)
+    u = jnp.zeros(n, one.dtype) if of_inputs is None else of_inputs.flatten(scene.params.inputs)
+    of_balance, of_rows, allowed = jax.jacfwd(balance, argnums=of_state)(*state[:2], u)
+    by_q, by_qdot, *by_u = (nan_unless(smooth, x) for x in of_balance)
+    pushes = solve(by_u[0], of_rows[2]) if by_u else solve(one, jnp.zeros((len(gamma), n), one.dtype))
+    a = jnp.block([[zero, one], [solve(by_q, of_rows[0]), solve(by_qdot, of_rows[1])]])
+    b, rates = jnp.concatenate([jnp.zeros_like(pushes), pushes]), -by_qdot
+    matrices = a, b, mass, 0.5 * (rates + rates.T), 0.5 * (rates - rates.T), -by_q, jacobian
+    return matrices, (*_output_matrices(of_inputs, sensor, scene, u), jnp.hstack(allowed[:2]))
 
 
 def _sample(scene: SceneState, of_inputs: Layout | None, dt) -> tuple[Array, Array]:

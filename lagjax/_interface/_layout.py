@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,15 +32,19 @@ class Layout:
     dtype: np.dtype
 
     @classmethod
-    def from_state(cls, q: PyTree, qdot: PyTree) -> "Layout":
-        """Read the layout of a state; raise `TypeError` or `ValueError`, with a sentence, where (q, qdot) is none."""
+    def from_state(cls, q: PyTree, qdot: PyTree, name: str = "qdot") -> "Layout":
+        """Read the layout of a state; raise `TypeError` or `ValueError`, with a sentence, where (q, qdot) is none.
+
+        The rates of q that are given in the place of q̇ have another `name`.
+        """
         paths, tree, shapes, dtypes = _structure(q, "q")
-        _, qdot_tree, qdot_shapes, qdot_dtypes = _structure(qdot, "qdot")
+        _, qdot_tree, qdot_shapes, qdot_dtypes = _structure(qdot, name)
         if tree != qdot_tree:
-            raise ValueError(f"q and qdot must have the same structure; got {tree} for q and {qdot_tree} for qdot.")
+            raise ValueError(f"q and {name} must have the same structure; got {tree} for q and {qdot_tree} for {name}.")
+        rate = "velocity" if name == "qdot" else "acceleration"
         for path, shape, qdot_shape in zip(paths, shapes, qdot_shapes, strict=True):
             if shape != qdot_shape:
-                raise ValueError(f"{path} has shape {shape}, but its velocity has shape {qdot_shape}: they must agree.")
+                raise ValueError(f"{path} has shape {shape}, but its {rate} has shape {qdot_shape}: they must agree.")
         if not sum(math.prod(shape) for shape in shapes):
             raise ValueError("q has no coordinates: it must hold at least one number.")
         dtypes = {*dtypes, *qdot_dtypes}
@@ -136,6 +141,13 @@ def describe_numbers(tree: PyTree, name: str) -> str:
         for place, value in np.ndenumerate(np.asarray(leaf))
     ]
     return join_names(found)
+
+
+def number_names(tree: PyTree, name: str) -> list[str]:
+    """A name for each number in a pytree, such as params['m'][0], in the order of its leaves."""
+    labels, leaves, _ = labelled_leaves(tree, name)
+    shapes = [(label, np.shape(leaf)) for label, leaf in zip(labels, leaves, strict=True) if eqx.is_array_like(leaf)]
+    return [label + str(list(at)) * bool(shape) for label, shape in shapes for at in np.ndindex(shape)]
 
 
 def labelled_leaves(tree: PyTree, name: str, is_leaf=None) -> tuple[tuple[str, ...], list, Any]:
