@@ -46,6 +46,6 @@ __all__ = [
     "Animation", "CanonicalTrajectory", "ChangedCoordinates", "Comparison", "Conserved", "ConservedQuantities",
     "ContactChanges", "Crossings", "Equations", "Equilibrium", "Experiments", "Explanation", "Family", "Finding",
     "Findings", "Fit", "Hamiltonian", "Health", "Impacts", "Linearization", "LyapunovExponent", "Modes", "Orbit",
-    "Path", "Prediction", "Profile", "ReducedLinearization", "Routhian", "SameMotion", "State", "Status", "SteadyMotion",
-    "Summary", "Trajectory", "Transitions", "WorkPrecision", "WorkPrecisionRow",
+    "Path", "Prediction", "Profile", "ReducedLinearization", "Routhian", "SameMotion", "State", "Status",
+    "SteadyMotion", "Summary", "Trajectory", "Transitions", "WorkPrecision", "WorkPrecisionRow",
 ]  # fmt: skip
