@@ -149,13 +149,11 @@ class CheckedScene(NamedTuple):
         return x[:n], x[n:]
 
     def jacobian(self) -> np.ndarray:
-        """∂q̈/∂(q, q̇) at the state, (n, 2n), by the implicit function theorem."""
-        acceleration, multipliers = self.solve_saddle()
+        """∂q̈/∂(q, q̇) at the state, (n, 2n): by the implicit function theorem and programs, or compiled by XLA."""
         try:
-            varied = _program_variation(self.derivation, self.state, acceleration, multipliers)
+            varied = _program_variation(self.derivation, self.state, *self.solve_saddle())
         except Unlowerable:
-            q, qdot, t, params = self.arguments
-            varied = np.asarray(_variation(self.system, q, qdot, t, params, acceleration, multipliers))
+            return np.concatenate(_acceleration_slopes(self.system, *self.arguments), axis=1)
         return self._solve(-varied)[: self.layout.size]
 
     def _solve(self, b: np.ndarray) -> np.ndarray:
@@ -324,16 +322,8 @@ def _rounding(*terms):
 
 
 @eqx.filter_jit
-def _variation(system: System, q, qdot, t, params, acceleration, multipliers):
-    """The slopes of M q̈ − Gᵀλ − F and G q̈ − γ by (q, q̇), (n + m, 2n), for constant q̈ and λ: compiled by XLA."""
-    layout = Layout.from_state(q, qdot)
-    motion, numbers = system._motion(layout, params), eqx.filter(params, eqx.is_array_like)
-
-    def balance(y):
-        q, qdot = jnp.split(y, 2)
-        matrix, force = motion.mass_matrix_and_force(q, qdot, t, numbers)
-        jacobian, gamma = (of(q, qdot, t, numbers) for of in (motion.constraints.jacobian, motion.constraints.gamma))
-        left = matrix @ acceleration - jacobian.T @ multipliers - force
-        return jnp.concatenate([left, jacobian @ acceleration - gamma])
-
-    return jax.jacfwd(balance)(jnp.concatenate([layout.flatten(q), layout.flatten(qdot)]))
+def _acceleration_slopes(system: System, q, qdot, t, params):
+    """∂q̈/∂q and ∂q̈/∂q̇, (n, n) each."""
+    layout, numbers = Layout.from_state(q, qdot), eqx.filter(params, eqx.is_array_like)
+    state = layout.flatten(q), layout.flatten(qdot), t, numbers
+    return jax.jacfwd(system._motion(layout, params).acceleration, argnums=(0, 1))(*state)
