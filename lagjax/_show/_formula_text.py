@@ -151,7 +151,7 @@ class FormulaWriter:
         if of.kind == "sum":
             first = min((place[1:3] for place in inner if place[0] == largest), default=(9, ""))
             return largest, first[0] if largest == _PARAMETER else 2, first[1]
-        return max(largest, _FUNCTION), 0, of.kind, atom
+        return max(largest, _FUNCTION), of.kind != "sin", of.kind, atom
 
     def _order(self, product: Product) -> tuple:
         """The place of a term in a sum, by its factors: those with velocities stand behind others, constants last."""

@@ -181,8 +181,8 @@ def test_known_scenes_look_as_in_a_textbook():
     sphere = scenes.spherical_pendulum()
     assert lines_of(sphere.system, sphere.q0, sphere.params)[1:] == [
         "M[phi, phi] = m*l**2*sin(theta)**2",
-        "F[theta] = m*l**2*cos(theta)*sin(theta)*phi_dot**2 - m*g*l*sin(theta)",
-        "F[phi] = -2*m*l**2*cos(theta)*sin(theta)*phi_dot*theta_dot",
+        "F[theta] = m*l**2*sin(theta)*cos(theta)*phi_dot**2 - m*g*l*sin(theta)",
+        "F[phi] = -2*m*l**2*sin(theta)*cos(theta)*phi_dot*theta_dot",
     ]
 
 
