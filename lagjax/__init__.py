@@ -24,7 +24,9 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 
 **What a scene does**
 
-- `equilibrium`, `linearize`, `normal_modes`: at rest and near it: `Equilibrium`, `Linearization`, `Modes`
+- `equilibrium`, `steady_motion`, `linearize`, `normal_modes`: at rest or rolling on, and near it: `Equilibrium`,
+  `SteadyMotion`, `Linearization` (`ReducedLinearization`), `Modes`
+- `inverse_dynamics`: the forces that an acceleration takes
 - `conserved_quantities`, `noether_charge`, `cyclic_coordinates`: symmetries: `ConservedQuantities`, each `Conserved`
 - `same_motion`: whether two Lagrangians have one motion, as `SameMotion`
 - `change_coordinates`, `hamiltonian`, `routhian`: the scene written otherwise: `ChangedCoordinates`, `Hamiltonian` with
@@ -71,11 +73,13 @@ if TYPE_CHECKING:  # each is imported on first use: all of them take as long as 
         cyclic_coordinates,
         equilibrium,
         hamiltonian,
+        inverse_dynamics,
         linearize,
         noether_charge,
         normal_modes,
         routhian,
         same_motion,
+        steady_motion,
     )
     from lagjax._analysis.orbits import (
         action,
@@ -120,10 +124,10 @@ __all__ = [
     "RESULTS", "Clipped", "Delayed", "FineOutput", "Gaussian", "Guess", "Hybrid", "MachineCode", "Quantised", "Record",
     "SimulationError", "Statistics", "Store", "StudentT", "Sweep", "System", "Timings", "Transition", "action", "angle",
     "between", "branch_off", "change_coordinates", "check", "conserved_quantities", "crossings", "cyclic_coordinates",
-    "designs", "equilibrium", "family", "find_path", "fit", "hamiltonian", "inertia", "linearize", "lyapunov_exponent",
-    "lyapunov_spectrum", "noether_charge", "normal_modes", "per_record", "periodic_orbit", "plot", "positive",
-    "results", "routhian", "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch", "sweep",
-    "work_precision", "wrapped",
+    "designs", "equilibrium", "family", "find_path", "fit", "hamiltonian", "inertia", "inverse_dynamics", "linearize",
+    "lyapunov_exponent", "lyapunov_spectrum", "noether_charge", "normal_modes", "per_record", "periodic_orbit", "plot",
+    "positive", "results", "routhian", "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch",
+    "steady_motion", "sweep", "work_precision", "wrapped",
 ]  # fmt: skip
 
 
@@ -152,6 +156,12 @@ def _load_contacts():
     return contacts
 
 
+def _load_run():
+    from lagjax import _run
+
+    return _run
+
+
 register(
     Registered(
         summary=lambda run: _load_show().summary(run),
@@ -165,6 +175,7 @@ register(
         make_animation=lambda run, points, *look: _load_show().make_animation(run, points, *look),
         examine=lambda run, reference: _load_health().examine(run, reference),
         contact_forces=lambda run, name: _load_contacts().contact_forces(run, name),
+        find_states=lambda run, t: _load_run().find_states(run, t),
         describe_failure=lambda run, layout, why: _load_trust().describe_failure(run, layout, why),
     )
 )

@@ -27,8 +27,10 @@ from lagjax._analysis import (
     Hamiltonian,
     Linearization,
     Modes,
+    ReducedLinearization,
     Routhian,
     SameMotion,
+    SteadyMotion,
 )
 from lagjax._analysis.orbits import Family, LyapunovExponent, Orbit, Path
 from lagjax._fit import Comparison, Experiments, Fit, Prediction, Profile
@@ -44,6 +46,6 @@ __all__ = [
     "Animation", "CanonicalTrajectory", "ChangedCoordinates", "Comparison", "Conserved", "ConservedQuantities",
     "ContactChanges", "Crossings", "Equations", "Equilibrium", "Experiments", "Explanation", "Family", "Finding",
     "Findings", "Fit", "Hamiltonian", "Health", "Impacts", "Linearization", "LyapunovExponent", "Modes", "Orbit", "Path",
-    "Prediction", "Profile", "Routhian",
-    "SameMotion", "State", "Status", "Summary", "Trajectory", "Transitions", "WorkPrecision", "WorkPrecisionRow",
+    "Prediction", "Profile", "ReducedLinearization", "Routhian", "SameMotion", "State", "Status", "SteadyMotion",
+    "Summary", "Trajectory", "Transitions", "WorkPrecision", "WorkPrecisionRow",
 ]  # fmt: skip

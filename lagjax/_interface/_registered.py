@@ -22,6 +22,7 @@ class Registered(NamedTuple):
     make_animation: Callable[[Any, Callable, Any, float, float], Any]
     examine: Callable[[Any, Any], Any]
     contact_forces: Callable[[Any, str], Any]
+    find_states: Callable[[Any, Any], Any]
     describe_failure: Callable[[Any, Any, str | None], str]
 
 

@@ -19,7 +19,7 @@ from lagjax._program._small_equations import Eliminated, Sparse, constants, dot,
 
 
 class Coupled(NamedTuple):
-    """The borders that hold beside A z = r: A z − Σ μₖ actsₖ = r, normalsₖ · z = endₖ; `equations` are those of μ.
+    """The borders that hold, and A z = r: A z − Σ μₖ actsₖ = r, normalsₖ · z = endₖ; `equations` are those of μ.
 
     Of each pivot: its border, its coordinate, 1 where it is free, and the inverse of its slope where the border holds.
     """

@@ -275,7 +275,7 @@ class _SlidingForces:
         return Eliminated(eliminate(self.graph, rows), whole)
 
     def _pushes_back(self, j: int, effects, pushed: Sequence[int], missing: Sequence[int]) -> int:
-        """True where border j of positions pushes back what lies beside it; other borders may hold that there, too."""
+        """True where border j of positions pushes back what lies next to it; other borders may hold that there, too."""
         f, others = self.f, [k for k in range(len(pushed)) if k != j]
         if all(self.rows.order(k) > 1 for k in others):
             return pushed[j]

@@ -16,6 +16,12 @@ def block(q, v, params):
 
 
 BLOCK = lagjax.System(block, contacts=lambda q: {"floor": q[1], "wall": q[0]})
+ROUGH = lagjax.System(block, contacts=lambda q: q[1], friction=0.3, slip=lambda q, v: v[0])
+ROD = lagjax.System(
+    lambda q, v: 0.5 * v @ v - G * q[1] + 3 * q[0],
+    constraints=lambda q: {"rod": q @ q - 1},
+    contacts=lambda q: {"wall": 0.6 - q[0]},
+)
 PULLED, PRESSED = {"k": 50.0, "a": 1.0}, {"k": 50.0, "a": -0.2}
 
 
@@ -68,9 +74,8 @@ def test_the_sentence_says_which_contact_closes():
     assert "contacts['wall'] is -0.2: this contact closes" in say(lagjax.equilibrium, np.array([0.3, 0.0]), PRESSED)
     assert "is negative at q" in say(lagjax.equilibrium, np.array([0.3, -0.1]), PULLED)
     assert "simulate this one" in say(lagjax.equilibrium, np.zeros(2), PRESSED, stable=True)
-    rough = lagjax.System(block, contacts=lambda q: q[1], friction=0.3, slip=lambda q, v: v[0])
     with pytest.raises(ValueError, match="closed contacts with friction"):
-        lagjax.equilibrium(rough, np.array([1.0, 0.0]), PULLED)
+        lagjax.equilibrium(ROUGH, np.array([1.0, 0.0]), PULLED)
 
 
 @pytest.mark.slow
@@ -91,12 +96,7 @@ def test_four_feet_carry_a_load_wherever_they_can():
 @pytest.mark.slow
 def test_constraints_come_along_and_singles_too():
     """A weight on a rod that leans against a wall, by statics."""
-    rod = lagjax.System(
-        lambda q, v: 0.5 * v @ v - G * q[1] + 3 * q[0],
-        constraints=lambda q: {"rod": q @ q - 1},
-        contacts=lambda q: {"wall": 0.6 - q[0]},
-    )
     for dtype, rtol in ((jnp.float64, 1e-12), (jnp.float32, 1e-6)):
-        rest = lagjax.equilibrium(rod, jnp.array([0.6, 0.8], dtype))
+        rest = lagjax.equilibrium(ROD, jnp.array([0.6, 0.8], dtype))
         np.testing.assert_allclose(rest.multipliers["rod"], G / 1.6, rtol=rtol)
         np.testing.assert_allclose(rest.contact_forces["wall"], 3 + 1.2 * G / 1.6, rtol=rtol)

@@ -15,6 +15,8 @@ TS = np.linspace(0.0, 5.0, 6)
 START = np.array([1.0, 0.2]), np.array([0.0, 1.1])
 
 CENTRAL = lagjax.System(lambda q, v: 0.5 * (v["r"] ** 2 + (q["r"] * v["phi"]) ** 2) + 1 / q["r"])
+CIRCLE = lagjax.System(free_particles, constraints=lambda q: q @ q - 4.0)
+ROD = lagjax.System(free_particles, constraints=lambda q: q @ q - 1)
 
 
 def polar(p):
@@ -63,8 +65,7 @@ def test_forces_and_constraints_come_along():
     force = changed.system.generalized_force(*state)
     kinetic = {"r": 2.0 * 0.7**2, "phi": 0.0}  # ∂L/∂Q
     np.testing.assert_allclose(sum((force[k] - kinetic[k]) * state[1][k] for k in force), power, rtol=1e-13)
-    circle = lagjax.System(free_particles, constraints=lambda q: q @ q - 4.0)
-    assert np.abs(lagjax.change_coordinates(circle, polar).system.constraint_residual(*state)) < 1e-14
+    assert np.abs(lagjax.change_coordinates(CIRCLE, polar).system.constraint_residual(*state)) < 1e-14
     with pytest.raises(ValueError, match="There are 1 new coordinates for 2 old ones"):
         lagjax.change_coordinates(KEPLER, lambda a: jnp.array([a, a])).new_from_old(*START, 1.0)
     lost, _ = changed.new_from_old(*START, {"r": 0.0, "phi": 0.1})
@@ -138,6 +139,5 @@ def test_what_cannot_be_reduced_is_said():
     drag = lagjax.System(free_particles, forces=lambda q, v: -v)
     with pytest.raises(ValueError, match="without constraints, forces"):
         lagjax.routhian(drag, *START)
-    rod = lagjax.System(free_particles, constraints=lambda q: q @ q - 1)
     with pytest.raises(ValueError, match="without constraints"):
-        lagjax.hamiltonian(rod)
+        lagjax.hamiltonian(ROD)

@@ -58,6 +58,9 @@ def phi4(q, v):
 
 
 PHI4 = lagjax.System(phi4)
+TRAIN = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * jnp.sum((jnp.diff(q) - 1) ** 2))
+LOOSE = lagjax.System(lambda q, v: PHI4.lagrangian(q[1:], v[1:]) + 0.5 * v[0] ** 2 * (1 + q[1] ** 2))
+PENDULUMS = lagjax.System(lambda q, v: 0.5 * v @ v + jnp.sum(jnp.cos(q)) - 0.5 * jnp.sum(jnp.diff(q) ** 2))
 
 
 def test_equilibrium_of_a_ring():
@@ -68,8 +71,7 @@ def test_equilibrium_of_a_ring():
 
 
 def test_a_family_of_equilibria_is_met_where_it_is_nearest():
-    train = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * jnp.sum((jnp.diff(q) - 1) ** 2))
-    rest = lagjax.equilibrium(train, 1.1 * np.arange(300.0)).q
+    rest = lagjax.equilibrium(TRAIN, 1.1 * np.arange(300.0)).q
     np.testing.assert_allclose(rest, 0.05 * 299 + np.arange(300.0), rtol=1e-12)
 
 
@@ -103,12 +105,11 @@ def test_a_ring_falls_from_its_unstable_equilibrium():
 def test_other_forms_of_a_large_scene():
     n = 4000
     q, v = np.asarray(np.random.default_rng(0).normal(size=(2, n)))
-    loose = lagjax.System(lambda q, v: PHI4.lagrangian(q[1:], v[1:]) + 0.5 * v[0] ** 2 * (1 + q[1] ** 2))
-    assert lagjax.cyclic_coordinates(loose, q, v) == ("q[0]",)
-    canonical = lagjax.hamiltonian(loose)
+    assert lagjax.cyclic_coordinates(LOOSE, q, v) == ("q[0]",)
+    canonical = lagjax.hamiltonian(LOOSE)
     p = canonical.momentum(q, v)
     np.testing.assert_allclose(canonical.velocity(q, p), v, rtol=1e-12)
-    np.testing.assert_allclose(canonical.energy(q, p), loose.energy(q, v), rtol=1e-12)
+    np.testing.assert_allclose(canonical.energy(q, p), LOOSE.energy(q, v), rtol=1e-12)
     assert lagjax.same_motion(PHI4, lagjax.System(lambda q, v: 3 * phi4(q, v)), q, v)
     total = lagjax.noether_charge(RING, jnp.ones_like)
     np.testing.assert_allclose(total(q, v), np.sum(v), rtol=1e-12)
@@ -127,8 +128,7 @@ def test_advice_for_large_scenes():
 
 
 def test_few_modes_of_a_small_scene():
-    pendulums = lagjax.System(lambda q, v: 0.5 * v @ v + jnp.sum(jnp.cos(q)) - 0.5 * jnp.sum(jnp.diff(q) ** 2))
-    all_modes, two = (lagjax.normal_modes(pendulums, np.zeros(4), count=count) for count in (None, 2))
+    all_modes, two = (lagjax.normal_modes(PENDULUMS, np.zeros(4), count=count) for count in (None, 2))
     np.testing.assert_array_equal(two.frequencies, all_modes.frequencies[:2])
     np.testing.assert_array_equal(two.shapes, all_modes.shapes[:2])
 

@@ -54,6 +54,10 @@ def hoop_rest(speed):
 
 
 ROD = lagjax.System(lagrangians.weight_g, constraints=lambda q: {"rod": q @ q - 1.0})
+BOND = lagjax.System(lambda q, v, params: 0.5 * v @ v - 0.5 * (q[1] - q[0] - params) ** 2)
+FALLS = lagjax.System(lambda q, v: 0.5 * v["x"] ** 2 - G * q["x"])
+SLOPE = lagjax.System(lambda q, v: 0.5 * v**2 - jnp.exp(-q))
+DRIVEN = lagjax.System(lambda q, v, t: 0.5 * v**2 - 0.5 * (q - jnp.sin(t)) ** 2)
 
 
 # ---- the heart -------------------------------------------------------------------------------------------------------
@@ -95,30 +99,33 @@ def test_equilibrium_on_a_constraint():
 
 @pytest.mark.slow
 def test_a_family_of_equilibria_is_met_where_it_is_nearest():
-    bond = lagjax.System(lambda q, v, params: 0.5 * v @ v - 0.5 * (q[1] - q[0] - params) ** 2)
-    rest = lambda length: lagjax.equilibrium(bond, jnp.array([0.0, 2.0]), length).q
+    rest = lambda length: lagjax.equilibrium(BOND, jnp.array([0.0, 2.0]), length).q
     np.testing.assert_allclose(rest(1.0), [0.5, 1.5], atol=1e-12)
     np.testing.assert_allclose(jax.jit(jax.jacfwd(rest))(1.0), [-0.5, 0.5], atol=1e-12)
 
 
 @pytest.mark.slow
 def test_what_has_no_equilibrium_is_said():
-    falls = lagjax.System(lambda q, v: 0.5 * v["x"] ** 2 - G * q["x"])
     with pytest.raises(ValueError, match=r"no equilibrium.*force of q\['x'\] is not zero"):
-        lagjax.equilibrium(falls, {"x": 1.0})
-    slope = lagjax.System(lambda q, v: 0.5 * v**2 - jnp.exp(-q))
+        lagjax.equilibrium(FALLS, {"x": 1.0})
     with pytest.raises(ValueError, match="No equilibrium was found from q = 1"):
-        lagjax.equilibrium(slope, 1.0)
-    lost = lagjax.equilibrium(slope, 1.0, throw=False)
+        lagjax.equilibrium(SLOPE, 1.0)
+    lost = lagjax.equilibrium(SLOPE, 1.0, throw=False)
     assert not lost.ok and np.isnan(lost.q)
-    driven = lagjax.System(lambda q, v, t: 0.5 * v**2 - 0.5 * (q - jnp.sin(t)) ** 2)
     with pytest.raises(ValueError, match="does not depend on the time"):
-        lagjax.equilibrium(driven, 1.0)
+        lagjax.equilibrium(DRIVEN, 1.0)
     with pytest.raises(ValueError, match=r"q\['r'\]: has a velocity, but is not cyclic"):
         lagjax.equilibrium(ORBIT, {"r": 0.8, "phi": 1.0}, qdot={"r": 1.0, "phi": 1.0})
 
 
 ORBIT = lagjax.System(lambda q, v: 0.5 * (v["r"] ** 2 + q["r"] ** 2 * v["phi"] ** 2) + 1 / q["r"])
+PLANE = lagjax.System(
+    lambda q, v, params: 0.5 * v @ v - 0.5 * q @ jnp.array([[params[0], params[2]], [params[2], params[1]]]) @ q
+)
+FIELD = lagjax.System(lambda q, v: 0.5 * v @ v + q[0] * v[1] - q[1] * v[0] - 0.5 * q @ q)
+DAMPED = lagjax.System(lagrangians.oscillators, dissipation=lambda q, v, params: 0.5 * params * v @ v)
+WEDGE = lagjax.System(lambda q, v: v["X"] ** 2 + v["X"] * v["x"] + v["x"] ** 2 - 0.5 * q["x"] ** 2)
+SLIDING = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - 0.5 * q @ q)
 
 
 @pytest.mark.slow
@@ -192,26 +199,21 @@ def test_hanging_chain_of_beads(n):
 
 @pytest.mark.slow
 def test_equal_frequencies_have_derivatives():
-    plane = lagjax.System(
-        lambda q, v, params: 0.5 * v @ v - 0.5 * q @ jnp.array([[params[0], params[2]], [params[2], params[1]]]) @ q
-    )
-    total = lambda params: lagjax.normal_modes(plane, jnp.zeros(2), params).frequencies.sum()
+    total = lambda params: lagjax.normal_modes(PLANE, jnp.zeros(2), params).frequencies.sum()
     both = np.array([2.0, 2.0, 0.0])
     np.testing.assert_allclose(jax.grad(total)(both), np.array([1, 1, 0]) / np.sqrt(8), atol=1e-14)
-    squares = lambda params: jnp.sum(lagjax.normal_modes(plane, jnp.zeros(2), params).frequencies ** 2)
+    squares = lambda params: jnp.sum(lagjax.normal_modes(PLANE, jnp.zeros(2), params).frequencies ** 2)
     np.testing.assert_allclose(jax.hessian(squares)(np.array([2.0, 2.0, 0.0])), np.zeros((3, 3)), atol=1e-13)
 
 
 @pytest.mark.slow
 def test_gyroscopic_and_damped_modes():
-    field = lagjax.System(lambda q, v: 0.5 * v @ v + q[0] * v[1] - q[1] * v[0] - 0.5 * q @ q)
     np.testing.assert_allclose(
-        lagjax.normal_modes(field, np.zeros(2)).frequencies, np.sqrt(2) + np.array([-1, 1]), rtol=1e-13
+        lagjax.normal_modes(FIELD, np.zeros(2)).frequencies, np.sqrt(2) + np.array([-1, 1]), rtol=1e-13
     )
-    damped = lagjax.System(lagrangians.oscillators, dissipation=lambda q, v, params: 0.5 * params * v @ v)
 
     def modes(c):
-        return lagjax.normal_modes(damped, jnp.zeros(2), c)
+        return lagjax.normal_modes(DAMPED, jnp.zeros(2), c)
 
     np.testing.assert_allclose(modes(0.1).frequencies, np.sqrt(1 - 0.0025), rtol=1e-13)
     np.testing.assert_allclose(modes(0.1).damping_ratios, 0.05, rtol=1e-13)
@@ -234,8 +236,7 @@ def test_modes_on_constraints():
 
 @pytest.mark.slow
 def test_zero_modes_of_cyclic_coordinates():
-    wedge = lagjax.System(lambda q, v: v["X"] ** 2 + v["X"] * v["x"] + v["x"] ** 2 - 0.5 * q["x"] ** 2)
-    modes = lagjax.normal_modes(wedge, {"X": 0.3, "x": 0.0})
+    modes = lagjax.normal_modes(WEDGE, {"X": 0.3, "x": 0.0})
     np.testing.assert_allclose(modes.frequencies, [0.0, np.sqrt(2 / 3)], atol=1e-14)
     np.testing.assert_allclose(modes.shapes["X"][1] / modes.shapes["x"][1], -0.5, rtol=1e-13)
     assert modes.stable and "zero mode" in str(modes)
@@ -243,9 +244,8 @@ def test_zero_modes_of_cyclic_coordinates():
 
 @pytest.mark.slow
 def test_what_has_no_modes_is_said():
-    sliding = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - 0.5 * q @ q)
     with pytest.raises(ValueError, match="mass matrix is singular or not positive definite"):
-        lagjax.normal_modes(sliding, np.zeros(2))
+        lagjax.normal_modes(SLIDING, np.zeros(2))
     down, twice = np.array([0.0, -1.0]), lambda q: [q @ q - 1.0, 2 * (q @ q) - 2.0]
     redundant = lagjax.System(lagrangians.weight_g, constraints=twice)
     with pytest.raises(ValueError, match="Drop the redundant ones"):

@@ -31,6 +31,21 @@ def bodies(q, v, params):
 
 
 BODIES = lagjax.System(bodies)
+BOOSTED = lagjax.System(lambda q, v, t: 1.5 * (v + 3 * q) ** 2 - 13.5 * q**2 + v * jnp.sin(t) + q * jnp.cos(t))
+FIELD = lagjax.System(lambda q, v: 0.5 * v @ v + 0.7 * (q[0] * v[1] - q[1] * v[0]))
+HEAVY = lagjax.System(lambda q, v: 0.5 * (v[0] ** 2 + 2 * v[1] ** 2) + 1 / jnp.sqrt(jnp.sum(q**2)))
+WAVE = lagjax.System(lambda q, v, t: 0.5 * v @ v - jnp.cos(q[0] - t) - q[1] ** 2)
+CURL = lagjax.System(lagrangians.free_particles, forces=lambda q, v: jnp.array([q[1], -q[0]]))
+INVERSE_SQUARE = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 / (q @ q))
+TODA = lagjax.System(lambda q, v: 0.5 * v @ v - jnp.sum(jnp.exp(q - jnp.roll(q, -1))))
+DAMPED = lagjax.System(lambda q, v, t: jnp.exp(0.4 * t) * (0.5 * v**2 - 0.5 * q**2))  # Caldirola and Kanai
+HIDDEN = lagjax.System(lambda q, v: 0.5 * v @ v + jnp.cos(q[0]) * v[0] * q[1] + jnp.sin(q[0]) * v[1])
+DRAG = lagjax.System(lagrangians.weight, forces=lambda q, v: jnp.array([0.0, -v[1]]))
+SPHERE = lagjax.System(lambda q, v: 0.5 * v @ v - 9.81 * q[2], constraints=lambda q: q @ q - 1)
+SPHERICAL = lagjax.System(lambda q, v: 0.5 * (v["th"] ** 2 + (jnp.sin(q["th"]) * v["ph"]) ** 2))
+SPRING = lagjax.System(lambda q, v: 0.5 * v**2 + 0.5 * q**2)
+WEDGE = lagjax.System(lambda q, v: 0.5 * v @ v - jnp.abs(q[0]))
+SLOPE = lagjax.System(lambda q, v: 0.5 * v @ v - q[0])
 GALILEAN = [
     "energy",
     *(f"momentum along axis {i}" for i in range(3)),
@@ -51,8 +66,7 @@ def test_kepler_conserves_energy_and_angular_momentum():
 
 
 def test_a_boost_is_the_same_motion():
-    boosted = lagjax.System(lambda q, v, t: 1.5 * (v + 3 * q) ** 2 - 13.5 * q**2 + v * jnp.sin(t) + q * jnp.cos(t))
-    same = lagjax.same_motion(FREE, boosted, 0.0, 1.0)
+    same = lagjax.same_motion(FREE, BOOSTED, 0.0, 1.0)
     assert same.same is True and same
     np.testing.assert_allclose(same.factor, 1 / 3, rtol=1e-13)
 
@@ -99,21 +113,19 @@ def test_symmetric_top():
 
 @pytest.mark.slow
 def test_charge_in_a_uniform_field():
-    field = lagjax.System(lambda q, v: 0.5 * v @ v + 0.7 * (q[0] * v[1] - q[1] * v[0]))
     q, v = np.array([1.0, 0.5, 0.0]), np.array([1.0, 0.5, 0.2])
-    found = {c.name: c for c in lagjax.conserved_quantities(field, q, v)}
+    found = {c.name: c for c in lagjax.conserved_quantities(FIELD, q, v)}
     momenta = [f"momentum of q[{i}]" for i in range(3)]
     assert list(found) == ["energy", *momenta, "angular momentum in the plane 01", "centre of mass along axis 2"]
     assert [found[name].gauge is not None for name in momenta] == [True, True, False]
     np.testing.assert_allclose(found[momenta[0]].charge(q, v), v[0] - 1.4 * q[1], rtol=1e-13)
-    run = lagjax.simulate(field, q, v, np.linspace(0.0, 5.0, 6), rtol=1e-12)
+    run = lagjax.simulate(FIELD, q, v, np.linspace(0.0, 5.0, 6), rtol=1e-12)
     assert all(c.drift(run) < 1e-11 for c in found.values())
 
 
 @pytest.mark.slow
 def test_what_is_no_symmetry_is_not_reported():
-    heavy = lagjax.System(lambda q, v: 0.5 * (v[0] ** 2 + 2 * v[1] ** 2) + 1 / jnp.sqrt(jnp.sum(q**2)))
-    assert names(heavy, np.array([1.0, 0.0]), np.array([0.0, 1.2])) == ["energy"]
+    assert names(HEAVY, np.array([1.0, 0.0]), np.array([0.0, 1.2])) == ["energy"]
 
 
 def general(q, v, params):
@@ -139,8 +151,7 @@ def test_combinations():
 
     found = names(lagjax.System(screw), jnp.array([1.0, 0.3, 0.2]), jnp.array([1.0, 0.5, 0.2]))
     assert found == ["energy", "combination: +0.5 translation of q[2], +1 rotation from q[0] to q[1]"]
-    wave = lagjax.System(lambda q, v, t: 0.5 * v @ v - jnp.cos(q[0] - t) - q[1] ** 2)
-    assert names(wave, np.ones(2), np.ones(2)) == ["combination: +1 time translation, +1 translation of q[0]"]
+    assert names(WAVE, np.ones(2), np.ones(2)) == ["combination: +1 time translation, +1 translation of q[0]"]
 
 
 @pytest.mark.slow
@@ -160,66 +171,58 @@ def test_forces_with_a_potential_conserve_what_l_would():
     np.testing.assert_allclose(energy - energy[0], exact - exact[0], atol=1e-9)
     by_params = jax.grad(lambda k: found["energy"].charge(run.q[7], run.qdot[7], params=k))(1.3)
     np.testing.assert_allclose(by_params, 1.0 - 1 / np.linalg.norm(run.q[7]), rtol=1e-9)
-    curl = lagjax.System(lagrangians.free_particles, forces=lambda q, v: jnp.array([q[1], -q[0]]))
-    assert "energy" not in names(curl, *state)
+    assert "energy" not in names(CURL, *state)
 
 
 def test_a_dilation():
     """De Alfaro, Fubini & Furlan, Nuovo Cimento A 34 (1976) 569: D = h t − ½ p·q of an inverse square."""
-    inverse_square = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 / (q @ q))
     state = np.array([1.0, 0.0]), np.array([0.2, 1.2])
-    found = {c.name: c for c in lagjax.conserved_quantities(inverse_square, *state)}
+    found = {c.name: c for c in lagjax.conserved_quantities(INVERSE_SQUARE, *state)}
     assert list(found) == ["energy", "angular momentum in the plane 01", "dilation"]
     np.testing.assert_allclose(found["dilation"].charge(*state, 2.0), 2.0 * (0.5 * 1.48 + 0.5) - 0.5 * 0.2, rtol=1e-12)
 
 
 @pytest.mark.slow
 def test_toda_and_a_damped_oscillator():
-    toda = lagjax.System(lambda q, v: 0.5 * v @ v - jnp.sum(jnp.exp(q - jnp.roll(q, -1))))
-    assert names(toda, np.zeros(3), np.ones(3)) == ["energy", "total momentum", "centre of all coordinates"]
-    damped = lagjax.System(lambda q, v, t: jnp.exp(0.4 * t) * (0.5 * v**2 - 0.5 * q**2))  # Caldirola and Kanai
-    assert names(damped, 1.0, 0.5) == ["combination: +1 time translation, -0.2 scaling of q"]
+    assert names(TODA, np.zeros(3), np.ones(3)) == ["energy", "total momentum", "centre of all coordinates"]
+    assert names(DAMPED, 1.0, 0.5) == ["combination: +1 time translation, -0.2 scaling of q"]
     with pytest.raises(ValueError, match="finite at no state"):
         names(lagjax.System(lambda q, v: 0.5 * v**2 + jnp.log(q)), -5.0, 0.5)
 
 
 @pytest.mark.slow
 def test_a_gauge_that_is_no_polynomial():
-    hidden = lagjax.System(lambda q, v: 0.5 * v @ v + jnp.cos(q[0]) * v[0] * q[1] + jnp.sin(q[0]) * v[1])
-    found = {c.name: c for c in lagjax.conserved_quantities(hidden, jnp.ones(2), jnp.ones(2))}
-    run = lagjax.simulate(hidden, np.ones(2), np.array([0.3, 0.2]), np.linspace(0.0, 3.0, 4), rtol=1e-12)
+    found = {c.name: c for c in lagjax.conserved_quantities(HIDDEN, jnp.ones(2), jnp.ones(2))}
+    run = lagjax.simulate(HIDDEN, np.ones(2), np.array([0.3, 0.2]), np.linspace(0.0, 3.0, 4), rtol=1e-12)
     assert found["momentum of q[0]"].gauge is not None
     assert found["momentum of q[0]"].drift(run) < 1e-11
 
 
 @pytest.mark.slow
 def test_forces_and_constraints_are_respected():
-    drag = lagjax.System(lagrangians.weight, forces=lambda q, v: jnp.array([0.0, -v[1]]))
-    found = lagjax.conserved_quantities(drag, jnp.ones(2), jnp.ones(2))
+    found = lagjax.conserved_quantities(DRAG, jnp.ones(2), jnp.ones(2))
     assert "momentum of q[0]" in [c.name for c in found] and "energy" not in [c.name for c in found]
     assert "not conserved: energy, by a symmetry of L that a force or a constraint breaks" in found.notes
-    sphere = lagjax.System(lambda q, v: 0.5 * v @ v - 9.81 * q[2], constraints=lambda q: q @ q - 1)
     state = np.array([0.6, 0.0, -0.8]), np.array([0.0, 1.0, 0.0])
-    assert names(sphere, *state) == ["energy", "angular momentum in the plane 01"]
+    assert names(SPHERE, *state) == ["energy", "angular momentum in the plane 01"]
 
 
 @pytest.mark.slow
 def test_the_users_own_generators():
-    spherical = lagjax.System(lambda q, v: 0.5 * (v["th"] ** 2 + (jnp.sin(q["th"]) * v["ph"]) ** 2))
     state = {"th": 0.8, "ph": 0.3}, {"th": 0.1, "ph": 0.5}
 
     def about_x(q):
         return {"th": -jnp.sin(q["ph"]), "ph": -jnp.cos(q["ph"]) / jnp.tan(q["th"])}
 
-    assert "about x" in names(spherical, *state, generators={"about x": about_x})
-    charge = lagjax.noether_charge(spherical, about_x)
-    run = lagjax.simulate(spherical, *state, np.linspace(0.0, 3.0, 4), rtol=1e-12)
+    assert "about x" in names(SPHERICAL, *state, generators={"about x": about_x})
+    charge = lagjax.noether_charge(SPHERICAL, about_x)
+    run = lagjax.simulate(SPHERICAL, *state, np.linspace(0.0, 3.0, 4), rtol=1e-12)
     values = jax.vmap(charge)(run.q, run.qdot)
     np.testing.assert_allclose(values, values[0], atol=1e-11)
     with pytest.raises(TypeError, match="a generator must return the change of every coordinate"):
-        lagjax.noether_charge(spherical, lambda q: q["th"])(*state)
+        lagjax.noether_charge(SPHERICAL, lambda q: q["th"])(*state)
     with pytest.raises(TypeError, match="generator must have the form"):
-        lagjax.noether_charge(spherical, lambda: 1.0)
+        lagjax.noether_charge(SPHERICAL, lambda: 1.0)
 
 
 def test_charges_by_hand():
@@ -236,8 +239,7 @@ def test_charges_by_hand():
 
 @pytest.mark.slow
 def test_what_is_not_the_same_motion_is_said_where():
-    spring = lagjax.System(lambda q, v: 0.5 * v**2 + 0.5 * q**2)
-    other = lagjax.same_motion(FREE, spring, 0.0, 1.0)
+    other = lagjax.same_motion(FREE, SPRING, 0.0, 1.0)
     assert other.same is False and other.residual > 1e-2 and "the equation of q at q = (" in other.where
     nothing = lagjax.System(lambda q, v: q * v)
     assert not lagjax.same_motion(FREE, nothing, 0.0, 1.0).same
@@ -247,9 +249,7 @@ def test_what_is_not_the_same_motion_is_said_where():
 @pytest.mark.slow
 def test_one_piece_is_not_the_whole():
     # From q = 1 on |q| looks like q, under whose constant force L changes by dG/dt when it is moved.
-    wedge = lagjax.System(lambda q, v: 0.5 * v @ v - jnp.abs(q[0]))
-    conserved = lagjax.conserved_quantities(wedge, np.array([1.0, 0.2]), np.array([0.3, 1.0]))
+    conserved = lagjax.conserved_quantities(WEDGE, np.array([1.0, 0.2]), np.array([0.3, 1.0]))
     assert [one.name for one in conserved] == ["energy", "momentum of q[1]", "centre of mass along axis 1"]
     assert "piecewise" in str(conserved)
-    slope = lagjax.System(lambda q, v: 0.5 * v @ v - q[0])
-    assert not lagjax.same_motion(wedge, slope, np.array([1.0, 0.2]), np.array([0.3, 1.0]))
+    assert not lagjax.same_motion(WEDGE, SLOPE, np.array([1.0, 0.2]), np.array([0.3, 1.0]))

@@ -101,6 +101,21 @@ def test_a_start_inside_a_wall_is_named():
 
 
 DROP = lagjax.System(lambda q, v: 0.5 * v**2 - G * q, contacts=lambda q: q, restitution=0.6)
+CYLINDER = lagjax.System(
+    lambda q, v, params: 0.5 * (v["r"] ** 2 + (q["r"] * v["one"]) ** 2) + 0.5 * params * A**2 * v["two"] ** 2
+    - G * q["r"] * jnp.cos(q["one"]),
+    constraints=lambda q: R * q["one"] - A * (q["two"] - q["one"]),
+    contacts=lambda q: {"normal": q["r"] - R - A},
+)  # fmt: skip
+RACKET = lagjax.System(lambda q, v: 0.5 * v**2, contacts=lambda q, t: q - t, restitution=0.5)
+ROD = lagjax.System(
+    lambda q, v: 0.5 * (v[0] ** 2 + 0.1 * v[1] ** 2) - G * q[0], restitution=0.5,
+    contacts=lambda q: q[0] + 0.5 * jnp.array([1.0, -1.0]) * jnp.sin(q[1]),
+)  # fmt: skip
+HIDDEN = lagjax.System(
+    lambda q, v: 0.5 * v @ v, restitution=1.0,
+    contacts=lambda q: 1 - jnp.sqrt(jnp.maximum(jnp.abs(q[0]) - 1, 0.0) ** 2 + q[1] ** 2),
+)  # fmt: skip
 
 
 def test_a_motion_goes_on_from_where_it_came_to_an_impact():
@@ -277,14 +292,8 @@ R, A = 1.0, 0.25
 def test_the_chapters_cylinder_flies_off_by_itself(alpha):
     """It rolls by a constraint, and leaves where cos θ₁ = 2 cos θ₁⁰/(3 + α)."""
     start, end = 0.3, 1.2
-    cylinder = lagjax.System(
-        lambda q, v, params: 0.5 * (v["r"] ** 2 + (q["r"] * v["one"]) ** 2) + 0.5 * params * A**2 * v["two"] ** 2
-        - G * q["r"] * jnp.cos(q["one"]),
-        constraints=lambda q: R * q["one"] - A * (q["two"] - q["one"]),
-        contacts=lambda q: {"normal": q["r"] - R - A},
-    )  # fmt: skip
     q, ts = state(r=R + A, one=start, two=(R + A) / A * start), jnp.linspace(0.0, end, 7)
-    run = lagjax.simulate(cylinder, q, jax.tree.map(jnp.zeros_like, q), ts, alpha)
+    run = lagjax.simulate(CYLINDER, q, jax.tree.map(jnp.zeros_like, q), ts, alpha)
     reduced = Scene(
         lambda q, v, t, p: 0.5 * (v[0] ** 2 + (q[0] ** 2 + p[0] * (R + A) ** 2) * v[1] ** 2) - G * q[0] * jnp.cos(q[1]),
         gaps=lambda q, t, p: q[:1] - R - A,
@@ -509,22 +518,17 @@ def test_an_impact_that_gains_energy_is_suspicious():
 
 
 def test_a_racket_that_hits_a_ball_gains_no_energy_by_its_law():
-    racket = lagjax.System(lambda q, v: 0.5 * v**2, contacts=lambda q, t: q - t, restitution=0.5)
-    run = lagjax.simulate(racket, 1.0, -1.0, np.array([0.0, 1.0]))
+    run = lagjax.simulate(RACKET, 1.0, -1.0, np.array([0.0, 1.0]))
     assert float(run.impacts.energy_lost[0]) == pytest.approx(0.5 - 2.0) and not run.health().suspicious
 
 
 @pytest.mark.slow
 def test_health_counts_the_derivatives_that_are_lost():
     """Two feet of a rod that falls flat close at once; a tilt makes that two impacts, each with its derivatives."""
-    rod = lagjax.System(
-        lambda q, v: 0.5 * (v[0] ** 2 + 0.1 * v[1] ** 2) - G * q[0], restitution=0.5,
-        contacts=lambda q: q[0] + 0.5 * jnp.array([1.0, -1.0]) * jnp.sin(q[1]),
-    )  # fmt: skip
     tilts, ts = jnp.array([0.0, 0.1, 0.0]), jnp.array([0.0, 0.5])
 
     def run(tilt):
-        return lagjax.simulate(rod, jnp.stack([1.0 + 0.0 * tilt, tilt]), jnp.zeros(2), ts)
+        return lagjax.simulate(ROD, jnp.stack([1.0 + 0.0 * tilt, tilt]), jnp.zeros(2), ts)
 
     runs, slopes = jax.jit(jax.vmap(lambda tilt: (run(tilt), jax.jacfwd(lambda tilt: run(tilt).q[-1])(tilt))))(tilts)
     lost = ~np.isfinite(slopes).all(axis=1)
@@ -638,12 +642,8 @@ def test_poissons_law_with_friction_is_for_one_contact_in_a_plane():
 @pytest.mark.parametrize("duration", [5.9, 30.0])
 def test_a_gap_that_hides_a_corner_is_named(duration):
     """1 - sqrt(y**2) below y = 0 is 1 + y on its series: a wall at y = 1 is nowhere on it."""
-    hidden = lagjax.System(
-        lambda q, v: 0.5 * v @ v, restitution=1.0,
-        contacts=lambda q: 1 - jnp.sqrt(jnp.maximum(jnp.abs(q[0]) - 1, 0.0) ** 2 + q[1] ** 2),
-    )  # fmt: skip
     q, v = jnp.array([0.24765335, -1.0]), jnp.array([0.02608, 1.54014415])
-    run = lagjax.simulate(hidden, q, v, np.array([0.0, duration]), throw=False)
+    run = lagjax.simulate(HIDDEN, q, v, np.array([0.0, duration]), throw=False)
     assert run.result == lagjax.RESULTS.contact_missed
 
 

@@ -19,6 +19,7 @@ def falling(q, qdot):
 
 
 FALL = lagjax.System(falling)
+COUNTED = lagjax.System(lambda q, v, params: 0.5 * v**2 - sum(q**2 for _ in range(params["n"])))
 TS = np.linspace(0.0, 2.0, 5)
 
 
@@ -178,9 +179,8 @@ def test_results_of_the_analysis_read_as_sentences():
 
 
 def test_an_integer_of_params_and_an_unknown_dataclass_are_explained():
-    counted = lagjax.System(lambda q, v, params: 0.5 * v**2 - sum(q**2 for _ in range(params["n"])))
     with pytest.raises(TypeError) as error:
-        lagjax.simulate(counted, 1.0, 0.0, np.array([0.0, 1.0]), {"n": 3})
+        lagjax.simulate(COUNTED, 1.0, 0.0, np.array([0.0, 1.0]), {"n": 3})
     assert "let the function close over that integer" in str(error.value)
 
     @dataclasses.dataclass

@@ -25,6 +25,9 @@ from lagjax._interface import Layout
 WAYS = pytest.mark.parametrize(
     "path", [pytest.param("auto", id="machine code"), pytest.param("array", id="diffrax", marks=pytest.mark.slow)]
 )
+LEANING = lagjax.System(weight, constraints=lambda q, params: jnp.stack([q[0], q[0] + params * q[1]]))
+BELT = lagjax.System(weight, velocity_constraints=lambda q, v: v[0] - 1.0)
+SKATE = lagjax.System(weight, velocity_constraints=lambda q, v: v[0] - q[1] * v[1])
 DRIFT = 1e-12
 
 
@@ -44,6 +47,9 @@ def rebuilt(system, path="auto", **changed):
 
 def rod(q):
     return {"rod": 0.5 * (1 - q @ q)}
+
+
+WEIGHT_ON_A_ROD = lagjax.System(weight, constraints=rod)
 
 
 def hung(angle, rate=0.0):
@@ -198,7 +204,7 @@ def test_doubled_and_scaled_constraints_change_no_motion():
 
     q0, qdot0 = hung(1.2, 0.5)
     ts = np.linspace(0, 2, 3)
-    systems = [lagjax.System(weight, constraints=rod), lagjax.System(weight, constraints=lambda q: 1e6 * rod(q)["rod"])]
+    systems = [WEIGHT_ON_A_ROD, lagjax.System(weight, constraints=lambda q: 1e6 * rod(q)["rod"])]
     systems += [lagjax.System(weight, constraints=many, path=path) for path in ("auto", "array")]
     once, scaled, *twice = (lagjax.simulate(system, q0, qdot0, ts, rtol=1e-11) for system in systems)
     for other in (scaled, *twice):
@@ -225,20 +231,17 @@ def test_explain_says_what_constraints_cost_and_which_depend():
     free = WEIGHT.explain(q, v)
     assert free.constraints == () and free.projection_operations is None and "constraints" not in str(free)
     # The part of one constraint beside the other, squared, above and below the stated tolerance.
-    leaning = lagjax.System(weight, constraints=lambda q, params: jnp.stack([q[0], q[0] + params * q[1]]))
     for part, dependent in ((10.0, False), (0.1, True)):
         near = np.sqrt(part * rank_tolerance(np.float64))
-        assert bool(leaning.explain(v, v, params=near).dependent_constraints) == dependent
+        assert bool(LEANING.explain(v, v, params=near).dependent_constraints) == dependent
 
 
 def test_explain_knows_which_constraints_do_work():
     q = jnp.zeros(2)
-    belt = lagjax.System(weight, velocity_constraints=lambda q, v: v[0] - 1.0)
     moving = WEIGHT_ON_A_SLIDE
-    skate = lagjax.System(weight, velocity_constraints=lambda q, v: v[0] - q[1] * v[1])
-    kept = [scene.explain(q, q).energy_conserved for scene in (belt, moving, skate)]
+    kept = [scene.explain(q, q).energy_conserved for scene in (BELT, moving, SKATE)]
     assert kept == [False, False, True]
-    assert [scene.explain(q, q).explicit_time for scene in (belt, moving, skate)] == [False, True, False]
+    assert [scene.explain(q, q).explicit_time for scene in (BELT, moving, SKATE)] == [False, True, False]
 
 
 # ---- constraints that move, mass matrices that are singular, ranks that drop -----------------------------------------
@@ -326,6 +329,9 @@ def crank_alone(q, qdot, params):
     return code(scenes.slider_crank(1.0, 1.0).system.lagrangian)(whole, moving, params)
 
 
+CRANK_ALONE = lagjax.System(crank_alone)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "solver", [pytest.param(None, id="machine code"), pytest.param(diffrax.Dopri8(), id="diffrax")]
@@ -336,7 +342,7 @@ def test_slider_cranks_of_equal_bars_pass_their_dead_centre(solver):
     start, rate, ts = np.random.default_rng(0).uniform(0.2, 1.2, members), np.full(members, 4.0), np.linspace(0, 1.5, 4)
     q0 = scenes.SliderCrank(start, -start, 2 * np.cos(start))
     qdot0 = scenes.SliderCrank(rate, -rate, -2 * rate * np.sin(start))
-    free = lagjax.simulate_batch(lagjax.System(crank_alone), start, rate, ts, scene.params, rtol=1e-12)
+    free = lagjax.simulate_batch(CRANK_ALONE, start, rate, ts, scene.params, rtol=1e-12)
     assert np.mean(free.q[:, -1] > np.pi / 2) > 0.9
     # Not tighter: diffrax's steps must span the dead centre, near which rounding decides, and cannot be taken again.
     run = lagjax.simulate_batch(scene.system, q0, qdot0, ts, scene.params, rtol=1e-8, solver=solver)
@@ -359,7 +365,7 @@ def test_a_dead_centre_is_passed_rightly_or_not_at_all():
     # A step must not end where round-off decides between the branches; one that does is taken again.
     scene, ts = scenes.slider_crank(1.0, 1.0), np.linspace(0, 1.5, 6)
     start, rate, q0, qdot0 = turning_cranks(1000)
-    free = lagjax.simulate_batch(lagjax.System(crank_alone), start, rate, ts, scene.params, rtol=1e-13)
+    free = lagjax.simulate_batch(CRANK_ALONE, start, rate, ts, scene.params, rtol=1e-13)
     for rtol in (1e-6, 1e-8, 1e-10, 1e-12, 1e-13, 1e-14):
         run = lagjax.simulate_batch(scene.system, q0, qdot0, ts, scene.params, rtol=rtol)
         ok = np.asarray(run.ok)
@@ -380,7 +386,7 @@ def test_derivatives_through_steps_that_are_taken_again():
         return lagjax.simulate(scene.system, q0, qdot0, ts, scene.params, rtol=1e-11).q.x[-1]
 
     def place_alone(start, rate):
-        run = lagjax.simulate(lagjax.System(crank_alone), start, rate, ts, scene.params, rtol=1e-12)
+        run = lagjax.simulate(CRANK_ALONE, start, rate, ts, scene.params, rtol=1e-12)
         return 2 * jnp.cos(run.q[-1])
 
     found, expected = (jax.vmap(jax.grad(f, argnums=(0, 1)))(start, rate) for f in (place, place_alone))
@@ -390,7 +396,7 @@ def test_derivatives_through_steps_that_are_taken_again():
 
 @pytest.mark.slow
 def test_reverse_mode_through_constraints_needs_no_parameters():
-    system, ts, angle, step = lagjax.System(weight, constraints=rod), np.linspace(0, 1, 3), 1.0, 1e-4
+    system, ts, angle, step = WEIGHT_ON_A_ROD, np.linspace(0, 1, 3), 1.0, 1e-4
 
     def inside(angle):
         return lagjax.simulate(system, *hung(angle, 0.5), ts, rtol=1e-12).q[1, 0]
@@ -505,6 +511,7 @@ def linkage(q, qdot):
 
 
 GROUND = 2.0, 0.3  # length and direction of the line between the pivots
+LED = lagjax.System(weight, constraints=lambda q, t: jnp.stack([q[0] - t**2, q[1], q[0] + q[1] - t**2]))
 
 
 def closed_linkage(q):
@@ -514,19 +521,25 @@ def closed_linkage(q):
     return {"x": x, "y": y}
 
 
+LINKAGE = lagjax.System(linkage, constraints=closed_linkage)
+
+
 def parallelogram(a, qdot):
     """The branch in which opposite bars stay parallel, in the angle of the crank."""
     return linkage((a, GROUND[1], a), (qdot, 0.0, qdot))
 
 
+PARALLELOGRAM = lagjax.System(parallelogram)
+
+
 @pytest.mark.slow
 def test_accelerations_where_a_parallelogram_is_flat():
     # In line, both constraints hold the same direction; the motion goes on as that of the parallelogram.
-    minimal = lagjax.System(parallelogram)
+    minimal = PARALLELOGRAM
     away = np.array([0.0, 1e-12, 1e-9, 1e-7, 1e-6, 1e-5, 1e-4, 1e-2])
     expected = jax.vmap(lambda angle: minimal.acceleration(angle, 3.0))(GROUND[1] + away)
     layout = Layout.from_state(np.zeros(3), np.zeros(3))
-    motion = lagjax.System(linkage, constraints=closed_linkage)._motion(layout)
+    motion = LINKAGE._motion(layout)
     for path in ("scalar", "array"):
         form = equations_of(Derivation(motion, layout, None, path=path))
 
@@ -545,8 +558,8 @@ def test_parallelogram_linkages_pass_the_flat_configuration():
     members = 100
     start, ts = GROUND[1] + np.random.default_rng(0).uniform(0.2, 1.2, members), np.linspace(0, 1.5, 4)
     still, turning = np.zeros(members), np.full(members, -3.0)
-    system = lagjax.System(linkage, constraints=closed_linkage)
-    free = lagjax.simulate_batch(lagjax.System(parallelogram), start, turning, ts, rtol=1e-12)
+    system = LINKAGE
+    free = lagjax.simulate_batch(PARALLELOGRAM, start, turning, ts, rtol=1e-12)
     q0, qdot0 = np.stack([start, GROUND[1] + still, start], 1), np.stack([turning, still, turning], 1)
     run = lagjax.simulate_batch(system, q0, qdot0, ts, rtol=1e-8)
     assert np.all(free.q[:, -1] < GROUND[1] - 0.5) and run.ok.all() and drift(run) < DRIFT
@@ -560,7 +573,7 @@ def test_units_of_constrained_coordinates_do_not_matter():
         return weight(jnp.stack([q[0] / 1e3, q[1]]), jnp.stack([qdot[0] / 1e3, qdot[1]]))
 
     (q0, qdot0), ts, unit = hung(1.0, 0.5), np.linspace(0, 5, 3), np.array([1e3, 1])
-    plain = lagjax.simulate(lagjax.System(weight, constraints=rod), q0, qdot0, ts)
+    plain = lagjax.simulate(WEIGHT_ON_A_ROD, q0, qdot0, ts)
     scaled_rod = lagjax.System(in_units, constraints=lambda q: rod(jnp.stack([q[0] / 1e3, q[1]])))
     scaled = lagjax.simulate(scaled_rod, q0 * unit, qdot0 * unit, ts)
     np.testing.assert_allclose(scaled.q / unit, plain.q, rtol=1e-10, atol=1e-10)
@@ -583,8 +596,7 @@ def test_more_constraints_than_coordinates():
 
 def test_a_prescribed_motion_leaves_nothing_to_move_but_something_to_carry_it_out():
     ts = np.linspace(0, 0.6, 3)
-    led = lagjax.System(weight, constraints=lambda q, t: jnp.stack([q[0] - t**2, q[1], q[0] + q[1] - t**2]))
-    run = lagjax.simulate(led, np.zeros(2), np.zeros(2), ts)
+    run = lagjax.simulate(LED, np.zeros(2), np.zeros(2), ts)
     np.testing.assert_allclose(run.q[:, 0], ts**2, atol=1e-12)
     np.testing.assert_allclose(run.constraint_force(), np.tile([2, 9.81], (3, 1)), rtol=1e-9)
 
@@ -683,7 +695,7 @@ def test_jit_and_vmap_change_nothing():
 
 @pytest.mark.slow
 def test_single_precision():
-    system = lagjax.System(weight, constraints=rod)
+    system = WEIGHT_ON_A_ROD
     q0, qdot0 = (np.float32(x) for x in hung(1.0, 0.5))
     ts = np.linspace(0, 2, 5)
     fine = lagjax.simulate(system, *hung(1.0, 0.5), ts)
@@ -695,7 +707,7 @@ def test_single_precision():
 
 
 def test_backward_in_time():
-    system = lagjax.System(weight, constraints=rod)
+    system = WEIGHT_ON_A_ROD
     there = lagjax.simulate(system, *hung(1.0, 0.5), np.linspace(0, 3, 4), rtol=1e-12)
     back = lagjax.simulate(system, there.q[-1], there.qdot[-1], np.linspace(3, 0, 4), rtol=1e-12)
     np.testing.assert_allclose(back.q, there.q[::-1], atol=1e-10)
@@ -713,9 +725,12 @@ def bow(q):
     return {"bow": q[1] - q[0] ** 2}
 
 
+TWO_MASSES = lagjax.System(two_masses, constraints=bow)
+
+
 @pytest.mark.slow
 def test_projection_goes_to_the_nearest_state_in_the_metric_of_the_masses():
-    system, M = lagjax.System(two_masses, constraints=bow), np.diag([1.0, 9.0])
+    system, M = TWO_MASSES, np.diag([1.0, 9.0])
     q0, v0 = np.array([0.8, -0.5]), np.array([1.0, 2.0])
     q, v = system.project(q0, v0)
     x = np.linspace(-1, 1, 200_001)
@@ -733,7 +748,7 @@ def test_projection_goes_to_the_nearest_state_in_the_metric_of_the_masses():
 @pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_projection_is_differentiated_as_the_function_it_is(derivative):
-    system = lagjax.System(two_masses, constraints=bow)
+    system = TWO_MASSES
     state = np.array([0.8, -0.5, 1.0, 2.0])
     project = jax.jit(lambda x: jnp.concatenate(system.project(x[:2], x[2:])))
     central = [(project(state + e) - project(state - e)) / 2e-5 for e in 1e-5 * np.eye(4)]
@@ -838,7 +853,7 @@ def test_starts_that_cannot_be(constraints, q0, qdot0, sentence):
 
 
 def test_members_that_start_off_their_constraints_are_refused_alone():
-    system = lagjax.System(weight, constraints=rod)
+    system = WEIGHT_ON_A_ROD
     q0 = np.array([[0.0, -1.0], [0.0, -1.2], [1.0, 0.0]])
     run = lagjax.simulate_batch(system, q0, np.zeros((3, 2)), np.linspace(0, 1, 3))
     assert run.ok.tolist() == [True, False, True]

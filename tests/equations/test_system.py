@@ -24,12 +24,15 @@ def central(q, qdot, params):
     return 0.5 * params["m"] * (qdot.rho**2 + q.rho**2 * qdot.phi**2) + params["k"] / q.rho
 
 
+CENTRAL = lagjax.System(central)
+
+
 PARAMS = {"m": 2.0, "k": 3.0}
 Q, QDOT = Polar(1.5, 0.3), Polar(0.2, -0.7)
 
 
 def test_central_force_by_hand():
-    scene = lagjax.System(central)
+    scene = CENTRAL
     m, k = PARAMS["m"], PARAMS["k"]
     acceleration = scene.acceleration(Q, QDOT, params=PARAMS)
     np.testing.assert_allclose(acceleration.rho, Q.rho * QDOT.phi**2 - k / (m * Q.rho**2), rtol=1e-14)
@@ -114,7 +117,7 @@ def test_any_pytree_of_coordinates(q, qdot):
 
 @pytest.mark.slow
 def test_transformations_of_the_derivation():
-    scene = lagjax.System(central)
+    scene = CENTRAL
     states = Polar(np.linspace(1, 2, 5), np.linspace(0, 1, 5)), Polar(np.linspace(-1, 1, 5), np.ones(5))
     batched = jax.jit(jax.vmap(lambda q, v: scene.acceleration(q, v, 0.0, PARAMS)))(*states)
     for i in range(5):
@@ -189,7 +192,7 @@ def test_rules_and_tables_of_the_user_are_followed_in_derivatives():
 
 
 def test_float32_stays_float32():
-    scene = lagjax.System(central)
+    scene = CENTRAL
     q, v = jax.tree.map(jnp.float32, (Q, QDOT))
     assert scene.acceleration(q, v, params=jax.tree.map(jnp.float32, PARAMS)).rho.dtype == jnp.float32
 

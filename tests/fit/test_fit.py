@@ -244,6 +244,7 @@ def drag_of(power):
 
 
 DRAGGED = lagjax.System(lagrangian, dissipation=lambda q, v, params: dissipation(q, v, params) + params["d"] * v**4 / 4)
+FALL = lagjax.System(lambda q, v, params: 0.5 * v**2 + params / q)  # into the centre at t = 1.11
 
 
 def test_a_parameter_that_belongs_at_the_end_of_its_set_is_said_to():
@@ -559,10 +560,9 @@ def test_a_fit_that_cannot_be_is_refused(rows, arguments, message):
 
 @pytest.mark.slow
 def test_a_motion_that_fails_names_its_record_and_time():
-    fall = lagjax.System(lambda q, v, params: 0.5 * v**2 + params / q)  # into the centre at t = 1.11
     rows = [lagjax.Record(TS, 1.0 + 0 * TS, start=start) for start in ((9.0, 0.0), (1.0, 0.0))]
     with pytest.raises(ValueError, match=r"records\[1\] from t = 0 failed\. .* beyond t = 1\.1"):
-        lagjax.fit(fall, rows, 1.0, method="whole")
+        lagjax.fit(FALL, rows, 1.0, method="whole")
 
 
 def test_between_needs_an_interval():

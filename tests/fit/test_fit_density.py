@@ -25,6 +25,7 @@ def swing(start, k):
 
 
 SPRING, PLANE = lagjax.System(energy), lagjax.System(energy)
+PUSHED = lagjax.System(energy, forces=lambda q, qdot, inputs, params: params["push"] * inputs)
 
 
 def records(seed=0, sigma=0.05):
@@ -134,7 +135,6 @@ def test_gradients_bring_several_systems_to_where_least_squares_do(joint):
 @pytest.mark.slow
 def test_driven_free_and_timed_systems_have_one_density():
     # A driven record, one without inputs, and crossing times of a third system, with Student's noise.
-    pushed = lagjax.System(energy, forces=lambda q, qdot, inputs, params: params["push"] * inputs)
     rng = np.random.default_rng(2)
     driven = np.asarray(
         lagjax.simulate(
@@ -149,7 +149,7 @@ def test_driven_free_and_timed_systems_have_one_density():
         "gate": lagjax.Timings(lambda q, v: q, passed + 0.01 * rng.normal(size=5), 0.0, (1.0, 0.0)),
     }
     fit = lagjax.fit(
-        {"driven": pushed, "free": SPRING, "gate": SPRING}, given, {"k": 3.9, "push": 1.9}, hold="linear",
+        {"driven": PUSHED, "free": SPRING, "gate": SPRING}, given, {"k": 3.9, "push": 1.9}, hold="linear",
         noise=lagjax.StudentT(), method="whole",
     )  # fmt: skip
     density = fit.log_density(prior=lambda params: -0.5 * params["push"] ** 2)

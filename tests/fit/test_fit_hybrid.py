@@ -180,6 +180,10 @@ PUCK = lagjax.System(
     contacts=lambda q: jnp.stack([q, 1 - q]),
     restitution=lambda params: params["e"],
 )
+CUSHION = lagjax.System(
+    lambda q, v: 0.5 * v @ v, contacts=lambda q: q[1], slip=lambda q, v: v[0],
+    restitution=lambda params: params["e"], friction=lambda params: params["mu"],
+)  # fmt: skip
 
 
 @pytest.mark.slow
@@ -204,12 +208,8 @@ def test_a_puck_between_walls_is_found_from_far_or_said_not_to_be():
 @pytest.mark.slow
 @pytest.mark.parametrize("mu", [0.05, 0.3])
 def test_an_oblique_impact_that_slides_is_found_from_where_it_sticks(mu):
-    cushion = lagjax.System(
-        lambda q, v: 0.5 * v @ v, contacts=lambda q: q[1], slip=lambda q, v: v[0],
-        restitution=lambda params: params["e"], friction=lambda params: params["mu"],
-    )  # fmt: skip
     ts, start = np.linspace(0.0, 2.0, 101), (jnp.array([0.0, 1.0]), jnp.array([0.2772, -1.0]))
-    exact = np.asarray(lagjax.simulate(cushion, *start, ts, {"mu": 0.15, "e": 0.8}).q)  # from 0.154 on it sticks
+    exact = np.asarray(lagjax.simulate(CUSHION, *start, ts, {"mu": 0.15, "e": 0.8}).q)  # from 0.154 on it sticks
     record = lagjax.Record(ts, exact + 0.002 * np.random.default_rng(0).normal(size=exact.shape), start=start)
-    found = lagjax.fit(cushion, record, {"mu": mu, "e": 0.7}, transforms=lagjax.positive)
+    found = lagjax.fit(CUSHION, record, {"mu": mu, "e": 0.7}, transforms=lagjax.positive)
     assert found.ok and found.params["mu"] == pytest.approx(0.15, abs=0.003)

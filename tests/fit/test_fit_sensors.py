@@ -18,6 +18,7 @@ from lagjax._fit.model._sensor_faults import require_measurements
 TS = np.linspace(0.0, 12.0, 601)
 TRUTH = {"w2": 9.0, "c": 0.1}
 SCENE = lagjax.System(lambda q, v, params: 0.5 * v**2 + params["w2"] * jnp.cos(q), dissipation=damping)
+FALL = lagjax.System(lambda q, v, params: 0.5 * v**2 + params["g"] * q)
 EXACT = np.asarray(lagjax.simulate(SCENE, 1.2, 0.0, TS, TRUTH).q)
 NOISE = 5e-3 * np.random.default_rng(0).normal(size=601)
 PLACES = np.random.default_rng(1).choice(601, 60, replace=False)
@@ -87,8 +88,7 @@ def test_a_fit_with_limits_is_that_of_the_censored_likelihood():
     # A fall from rest, whose sensor ends at 0.6; the same likelihood by SciPy, without lagjax.
     ts = np.linspace(0.0, 0.5, 40)
     shown = np.minimum(0.5 * 9.81 * ts**2 + 0.05 * np.random.default_rng(2).normal(size=40), 0.6)
-    fall = lagjax.System(lambda q, v, params: 0.5 * v**2 + params["g"] * q)
-    found = lagjax.fit(fall, lagjax.Record(ts, shown, start=(0.0, 0.0)), {"g": 7.0}, noise=lagjax.Clipped(high=0.6))
+    found = lagjax.fit(FALL, lagjax.Record(ts, shown, start=(0.0, 0.0)), {"g": 7.0}, noise=lagjax.Clipped(high=0.6))
 
     def cost(x):
         e, sigma = 0.5 * x[0] * ts**2 - shown, np.exp(x[1])

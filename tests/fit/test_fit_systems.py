@@ -31,6 +31,7 @@ def energy(q, qdot, params):
 DOUBLE = lagjax.System(
     energy, dissipation=lambda q, qdot, params: 0.5 * params["bearing"] * (qdot[0] ** 2 + (qdot[1] - qdot[0]) ** 2)
 )
+ROD = lagjax.System(weight_in_gravity, constraints=lambda q: q @ q - 0.64)
 SYSTEMS = {"single": SINGLE, "double": DOUBLE}
 
 
@@ -201,16 +202,15 @@ def test_profiles_reports_and_plots_know_of_several_systems(joint, tmp_path):
 @pytest.mark.slow
 def test_crossing_times_of_one_system_and_constraints_of_another():
     gates = PENDULUM_IN_GRAVITY
-    rod = lagjax.System(weight_in_gravity, constraints=lambda q: q @ q - 0.64)
     sections, span = {"bottom": lambda q, qdot: q}, np.array([0.0, 6.0])
     times = lagjax.crossings(gates, sections, 1.0, 0.0, span, {"g": 9.81})["bottom"]
     passed = np.asarray(times.t)[: int(times.count)]
     q0 = 0.8 * np.array([np.sin(0.9), -np.cos(0.9)])
-    values = np.asarray(lagjax.simulate(rod, q0, 0 * q0, TS, {"g": 9.81}).q)
+    values = np.asarray(lagjax.simulate(ROD, q0, 0 * q0, TS, {"g": 9.81}).q)
     timings = lagjax.Timings(
         sections, {"bottom": passed}, t0=0.0, start=lagjax.Guess(0.9, 0.1), direction={"bottom": 0}
     )
-    fit = lagjax.fit({"gates": gates, "rod": rod}, {"gates": timings, "rod": lagjax.Record(TS, values)}, {"g": 9.0})
+    fit = lagjax.fit({"gates": gates, "rod": ROD}, {"gates": timings, "rod": lagjax.Record(TS, values)}, {"g": 9.0})
     # Both are exact to rtol 1e-9 of their motions.
     assert fit.params["g"] == pytest.approx(9.81, rel=1e-6)
     assert list(fit.noise) == ["gates: times", "rod: q[0]", "rod: q[1]"]

@@ -217,12 +217,15 @@ def double(q, v, params):
     return kinetic + 9.81 * (2 * a * jnp.cos(q[0]) + b * jnp.cos(q[1]))
 
 
+DOUBLE = lagjax.System(double)
+
+
 @pytest.mark.slow
 def test_a_long_chaotic_record_is_followed_in_pieces():
     truth, ts = {"a": 1.0, "b": 0.8}, np.linspace(0.0, 60.0, 6001)
-    q = np.asarray(lagjax.simulate(lagjax.System(double), np.array([2.0, 2.5]), np.zeros(2), ts, truth).q)
+    q = np.asarray(lagjax.simulate(DOUBLE, np.array([2.0, 2.5]), np.zeros(2), ts, truth).q)
     record = lagjax.Record(ts, q + SIGMA * np.random.default_rng(0).normal(size=q.shape))
-    found = lagjax.fit(lagjax.System(double), record, {"a": 1.3, "b": 1.04}, transforms=lagjax.positive)
+    found = lagjax.fit(DOUBLE, record, {"a": 1.3, "b": 1.04}, transforms=lagjax.positive)
     assert found.ok and "pieces, each with a start of its own" in found.message
     low, high = found.intervals(0.9999)
     assert all(low[k] <= x <= high[k] and high[k] - low[k] < 1e-3 for k, x in truth.items())

@@ -150,10 +150,10 @@ def test_a_jump_varies_as_its_border(mode):
     section = lambda q, v, params: jnp.where(q[0] ** 2 > params, 1.0 + q[1], q[1] - 1.0)
 
     def first(p):
-        start = jnp.array([0.0, 0.1]), jnp.array([1.0, 0.05])
-        return lagjax.crossings(scene, section, *start, jnp.array([0.0, 3.0]), p).t[0]
+        start = np.array([0.0, 0.1]), np.array([1.0, 0.05])
+        return lagjax.crossings(scene, section, *start, np.array([0.0, 3.0]), p).t[0]
 
-    slopes = first(2.0), mode(first)(2.0), jax.jit(jax.grad(mode(first)))(2.0)
+    slopes = first(2.0), *jax.jit(lambda p: (mode(first)(p), jax.grad(mode(first))(p)))(2.0)
     np.testing.assert_allclose(slopes, [np.sqrt(2), 0.5 / np.sqrt(2), -0.25 * 2**-1.5], rtol=1e-9)
 
 

@@ -149,7 +149,7 @@ COMPARISONS = {
 def test_a_comparison_is_located(name):
     # √(2h/g) after the release, and there d/dg = −t/2g; a motion that begins below ends where it begins.
     event, (h, g) = COMPARISONS[name], (1.0, 9.81)
-    t, slope = jax.value_and_grad(lambda g: fall(h, g, event=event).end.t)(g)
+    t, slope = jax.jit(jax.value_and_grad(lambda g: fall(h, g, event=event).end.t))(g)
     np.testing.assert_allclose([t, slope], [np.sqrt(2 * h / g), -np.sqrt(2 * h / g) / (2 * g)], rtol=1e-12)
     assert fall(0.0, event=event).end.t == 0.0
     below = lambda h: fall(h, event=event).end

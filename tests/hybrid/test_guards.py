@@ -17,6 +17,8 @@ G = 9.81
 T = lagjax.Transition
 FALL = lambda q, v: 0.5 * v @ v - G * q[1]
 SPHERE = {"on": lagjax.System(FALL, constraints=lambda q: q @ q - 1), "off": lagjax.System(FALL)}
+ROD = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 + v[1] ** 2 / 6 - G * q[0])
+BEADS = lagjax.System(lambda q, v, params: 0.5 * params @ v**2)
 ZENO, IN_TURN = lagjax.RESULTS.zeno, lagjax.RESULTS.transitions_in_turn
 
 
@@ -154,7 +156,6 @@ def test_a_bouncing_ball_comes_to_rest_as_the_sentence_advises():
 
 
 def test_blows_at_one_instant_that_do_not_commute_are_said():
-    rod = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 + v[1] ** 2 / 6 - G * q[0])
 
     def end(side):
         def reset(q, v):
@@ -165,7 +166,7 @@ def test_blows_at_one_instant_that_do_not_commute_are_said():
 
     def run(angle):
         q, ts = jnp.stack([1.0, angle]), jnp.array([0.0, 0.5])
-        return lagjax.simulate(lagjax.Hybrid({"f": rod}, [end(1), end(-1)], "f"), q, jnp.zeros(2), ts)
+        return lagjax.simulate(lagjax.Hybrid({"f": ROD}, [end(1), end(-1)], "f"), q, jnp.zeros(2), ts)
 
     flat = run(0.0)
     assert flat.transitions.order_matters.tolist()[:3] == [True, False, False] and flat.health().suspicious
@@ -181,9 +182,8 @@ def test_blows_at_one_instant_that_do_not_commute_are_said():
 
         return T("f", "f", lambda q, v: q[i + 1] - q[i], -1, reset)
 
-    beads = lagjax.System(lambda q, v, params: 0.5 * params @ v**2)
     meet = lambda m: lagjax.simulate(
-        lagjax.Hybrid({"f": beads}, [collide(0), collide(1)], "f"), jnp.array([-1.0, 0.0, 1.0]),
+        lagjax.Hybrid({"f": BEADS}, [collide(0), collide(1)], "f"), jnp.array([-1.0, 0.0, 1.0]),
         jnp.array([1.0, 0.0, -1.0]), jnp.array([0.0, 1.5]), m,
     )  # fmt: skip
     assert [bool(meet(m).transitions.order_matters.any()) for m in masses] == [False, True]

@@ -61,6 +61,8 @@ ROLLING = {
     ),
     "flight": lagjax.System(cylinder),
 }
+SOFT = lagjax.System(lambda q, v, params: 0.5 * v**2 - params["g"] * q - 0.5 * 1e3 * q**2)
+PLANE = lagjax.System(lambda q, v: 0.5 * v @ v)
 LEAVE = lagjax.Transition("rolling", "flight", lambda q, v, multipliers: multipliers["contact"], direction=-1)
 ROLL_TS = np.linspace(0.0, 3.0, 13)
 
@@ -267,11 +269,10 @@ def test_a_spent_budget_is_told_from_bounces_that_pile_up():
     with pytest.raises(lagjax.SimulationError, match=r"^(?!.*ever shorter).*The guard is pushed at its surface"):
         hybrid({"flight": BALL_IN_GRAVITY}, [bounce], 1.0, 0.0, (0.0, 5.0), {"g": G, "stop": 1.0})
     # Two modes that take turns, one above and one below the floor, which is soft: flight and contact alternate.
-    soft = lagjax.System(lambda q, v, params: 0.5 * v**2 - params["g"] * q - 0.5 * 1e3 * q**2)
     land = lagjax.Transition("flight", "floor", lambda q, v: q, direction=-1)
     leave = lagjax.Transition("floor", "flight", lambda q, v: q, direction=1, reset=lambda q, v: (q, 0.7 * v))
     run = hybrid(
-        {"flight": BALL_IN_GRAVITY, "floor": soft}, [land, leave], 1.0, 0.0, (0.0, 20.0), {"g": G}, throw=False
+        {"flight": BALL_IN_GRAVITY, "floor": SOFT}, [land, leave], 1.0, 0.0, (0.0, 20.0), {"g": G}, throw=False
     )
     assert run.result == spent, "a contact lasts as long for a small bounce as for a large one: no sum is finite"
 
@@ -419,8 +420,7 @@ def test_directions():
     counter = lambda weight: lambda q, v: (q.at[1].add(weight), v)
     guard = lambda q, v: jnp.cos(jnp.pi * q[0])
     sections = [lagjax.Transition("a", "a", guard, d, counter(w)) for d, w in ((-1, 1.0), (0, 10.0), (1, 100.0))]
-    plane = lagjax.System(lambda q, v: 0.5 * v @ v)
-    run = hybrid({"a": plane}, sections, jnp.zeros(2), jnp.array([1.0, 0.0]), (0.0, 1.0, 2.0, 4.0))
+    run = hybrid({"a": PLANE}, sections, jnp.zeros(2), jnp.array([1.0, 0.0]), (0.0, 1.0, 2.0, 4.0))
     np.testing.assert_allclose(times(run), np.repeat([0.5, 1.5, 2.5, 3.5], 2), rtol=1e-14)
     assert run.q[:, 1].tolist() == [0.0, 11.0, 121.0, 242.0]
 
@@ -599,6 +599,7 @@ def test_derivatives_through_transitions_at_one_instant():
 # A spring of stiffness k on the left and another on the right: half periods π/√k of one and the other.
 
 SPRING = lambda name: lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params[name] * q**2)
+POLE = lagjax.System(lambda q, v, params: 0.5 * v**2 + params / (1 - q))
 SIDES = {"right": SPRING("right"), "left": SPRING("left")}
 CROSS = [
     lagjax.Transition("right", "left", lambda q, v: q, -1),
@@ -660,12 +661,11 @@ def test_derivatives_through_different_modes_in_a_batch():
 @pytest.mark.slow
 def test_laws_that_are_singular_elsewhere_leave_no_nan_in_derivatives():
     # The first mode has a pole at q = 1, which the motion passes in the second.
-    pole = lagjax.System(lambda q, v, params: 0.5 * v**2 + params / (1 - q))
     transition = lagjax.Transition("pole", "free", lambda q, v, params: q - 0.5)
 
     def outcome(p):
         ts = (0.0, 0.25, 1.0, 2.0)
-        run = hybrid({"pole": pole, "free": FREE}, [transition], 0.0, 0.5, ts, p[0], rtol=1e-12, max_transitions=2)
+        run = hybrid({"pole": POLE, "free": FREE}, [transition], 0.0, 0.5, ts, p[0], rtol=1e-12, max_transitions=2)
         return jnp.stack([run.q[-1], jnp.sum(run.energy()), run.transitions.t[0], run.end.q])
 
     p = np.array([0.1])
@@ -674,7 +674,7 @@ def test_laws_that_are_singular_elsewhere_leave_no_nan_in_derivatives():
     late = lagjax.Transition("free", "pole", lambda q, v: q - 2.0)
 
     def energy(p):  # at q = 1, where the mode with the pole is not
-        run = hybrid({"free": FREE, "pole": pole}, [late], 0.0, 1.0, (0.0, 1.0, 1.5), p, max_transitions=1)
+        run = hybrid({"free": FREE, "pole": POLE}, [late], 0.0, 1.0, (0.0, 1.0, 1.5), p, max_transitions=1)
         return jnp.sum(run.energy()) + run.q[1]
 
     assert jax.jit(jax.grad(energy))(0.1) == 0.0
@@ -768,6 +768,7 @@ def stay(source="a", target="a", guard=lambda q, v: q - 0.5, **options):
 
 
 ROD = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q: q[1])
+MASSLESS = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - q[1] ** 2)
 
 
 @pytest.mark.parametrize(
@@ -880,10 +881,9 @@ def test_a_failure_names_the_mode():
 
 @pytest.mark.slow
 def test_a_failure_names_the_coordinate_without_mass_and_the_mode():
-    massless = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - q[1] ** 2)
     with pytest.raises(lagjax.SimulationError, match=r"q\[1\][^$]*mode 'b'"):
         pass_on = lagjax.Transition("a", "b", lambda q, v: q[0] - 0.5)
-        hybrid({"a": FREE_POINTS, "b": massless}, [pass_on], np.zeros(2), np.array([1.0, 0.0]))
+        hybrid({"a": FREE_POINTS, "b": MASSLESS}, [pass_on], np.zeros(2), np.array([1.0, 0.0]))
 
 
 @pytest.mark.slow

@@ -25,6 +25,9 @@ def valley(q, qdot, params):
     return 0.5 * qdot**2 - jnp.interp(q, params["x"], params["u"])
 
 
+VALLEY = lagjax.System(valley)
+
+
 def end_of(scene, params, **options):
     return lagjax.simulate(scene, -0.9, 1.6, END, params, **options).q[-1]
 
@@ -63,7 +66,7 @@ def table(count):
 def test_a_potential_by_a_table_of_parameters(count):
     # The local error is rtol = 1e-9 a step or below rounding of one, here of constant accelerations; over a thousand
     # borders the slopes by entries, of pieces a thousandth long, lose three digits of sixteen.
-    scene, params = lagjax.System(valley), table(count)
+    scene, params = VALLEY, table(count)
     np.testing.assert_allclose(end_of(scene, params, solver=MACHINE), exact_end(params), atol=1e-11)
     slopes, closed = jax.grad(lambda p: end_of(scene, p))(params), jax.jit(jax.grad(exact_end))(params)
     for name in "xu":
@@ -75,7 +78,7 @@ def test_a_potential_by_a_table_of_parameters(count):
 
 
 def test_members_with_tables_of_their_own():
-    scene, base = lagjax.System(valley), table(8)
+    scene, base = VALLEY, table(8)
     params = {
         "x": jnp.stack([base["x"], base["x"] + 0.05, 1.02 * base["x"]]),
         "u": base["u"] * jnp.array([[1], [0.9], [1.1]]),
@@ -88,7 +91,7 @@ def test_members_with_tables_of_their_own():
 
 
 def test_knots_that_do_not_increase_are_said():
-    scene, params = lagjax.System(valley), table(8)
+    scene, params = VALLEY, table(8)
     with pytest.raises(ValueError, match=r"0\.34 comes after .* 0\.41.*Sort them"):
         end_of(scene, params | {"x": params["x"].at[5].set(0.34)})
     with pytest.raises(ValueError, match=r"params\['x'\]\[5\] is nan"):
@@ -118,7 +121,7 @@ def test_second_and_third_derivatives_by_knots_of_a_potential():
 
     Compiles the tangent flows along one and two directions, and the transposes of the motion and of these.
     """
-    scene, params = lagjax.System(valley), table(8)
+    scene, params = VALLEY, table(8)
     end = lambda p: end_of(scene, p, solver=MACHINE)
     along = {"x": jnp.cos(jnp.arange(8.0)), "u": jnp.sin(jnp.arange(8.0))}
 
@@ -175,10 +178,10 @@ def test_tables_that_are_computed(name):
     def computed(q, qdot, params):
         return 0.5 * qdot**2 - jnp.interp(q, *tables(params))
 
-    scene, direct, params = lagjax.System(computed), lagjax.System(valley), table(8) | {"a": jnp.array(0.8)}
+    scene, direct, params = lagjax.System(computed), VALLEY, table(8) | {"a": jnp.array(0.8)}
     given = lambda p: end_of(direct, dict(zip("xu", tables(p), strict=True)))
     np.testing.assert_allclose(end_of(scene, params, solver=MACHINE), given(params), atol=1e-10)
-    slopes, chained = jax.grad(lambda p: end_of(scene, p))(params), jax.grad(given)(params)
+    slopes, chained = jax.jit(lambda p: (jax.grad(lambda p: end_of(scene, p))(p), jax.grad(given)(p)))(params)
     for of in params:
         np.testing.assert_allclose(slopes[of], chained[of], atol=1e-9)
 

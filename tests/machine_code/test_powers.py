@@ -12,6 +12,9 @@ from scipy.special import digamma, gamma
 import lagjax
 
 WELL = lagjax.System(lambda q, v, params: 0.5 * v**2 - params["k"] * abs(q) ** params["p"])
+DRAG = lagjax.System(
+    lambda q, v: 0.5 * v**2 - 0.5 * q**2, forces=lambda q, v, params: -params * jnp.sign(v) * abs(v) ** 1.7
+)
 EXPONENTS = np.array([1.5, 1.9, 2.0, 2.1, 3.0, 7.0, 10.0, 12.5])
 
 
@@ -48,10 +51,7 @@ def test_the_slope_by_a_whole_exponent_has_no_series_from_zero():
 
 @pytest.mark.slow
 def test_drag_of_a_start_at_rest_has_the_same_slopes_in_both_modes():
-    drag = lagjax.System(
-        lambda q, v: 0.5 * v**2 - 0.5 * q**2, forces=lambda q, v, params: -params * jnp.sign(v) * abs(v) ** 1.7
-    )
-    speed = lambda c: lagjax.simulate(drag, 1.0, 0.0, np.array([0.0, 2.0]), c).qdot[-1]
+    speed = lambda c: lagjax.simulate(DRAG, 1.0, 0.0, np.array([0.0, 2.0]), c).qdot[-1]
     assert abs(jax.grad(speed)(0.3) - jax.jvp(speed, (0.3,), (1.0,))[1]) < 1e-12
 
 

@@ -88,7 +88,7 @@ def test_a_band_limited_input_comes_back_from_its_samples(share):
     t = np.linspace(x[20], x[-21], 1001)
     u = lagjax.samples(x, sinusoids(x, share, step), "band")
     np.testing.assert_allclose(u(t), sinusoids(t, share, step), atol=3e-5)
-    rates = jax.vmap(jax.grad(u))(t)
+    rates = jax.jit(jax.vmap(jax.grad(u)))(t)
     closed = (sinusoids(t + 1e-6, share, step) - sinusoids(t - 1e-6, share, step)) / 2e-6
     np.testing.assert_allclose(rates, closed, atol=1e-4 * np.pi / step)
     np.testing.assert_allclose(u(x), sinusoids(x, share, step), atol=1e-13)
@@ -185,7 +185,7 @@ def test_motions_are_exact_at_every_tolerance(hold):
 
 
 def test_derivatives_by_samples_and_by_their_instants():
-    by = lambda f: jax.grad(lambda u, x, q: f("zero", x, u, q)[0], argnums=(0, 1, 2))
+    by = lambda f: jax.jit(jax.grad(lambda u, x, q: f("zero", x, u, q)[0], argnums=(0, 1, 2)))
     found, closed = (by(f)(np.asarray(VALUES), np.asarray(KNOTS), 0.3) for f in (end_of, exact))
     np.testing.assert_allclose(found[0], closed[0], atol=1e-12)
     np.testing.assert_allclose(found[1][1:-1], closed[1][1:-1], atol=1e-12)  # the first and the last are times of it

@@ -158,7 +158,7 @@ def test_sites_that_stop_at_one_instant_are_as_exact_as_alone():
     np.testing.assert_allclose(place(mu), exact(mu), atol=1e-11)
     slopes = (exact(mu + step) - exact(mu - step)) / (2 * step)
     for derivative in (jax.jacrev, jax.jacfwd):
-        np.testing.assert_allclose(derivative(place)(mu), slopes, atol=1e-8)
+        np.testing.assert_allclose(jax.jit(derivative(place))(mu), slopes, atol=1e-8)
 
 
 def test_sites_that_stop_at_one_instant_stop_beside_coupled_ones():
@@ -330,8 +330,8 @@ def exact(x):
 
 def start():
     """All come to their levels one after the other, and leave them at one instant."""
-    level, above, rates = jnp.array(AT), jnp.array(ABOVE), 0.8 + 0.05 * jnp.arange(len(STEPS))
-    return jnp.stack([0.1 + 0 * level, level - 0.3, 4 * above - 1.3 * rates, rates])
+    level, above, rates = np.array(AT), np.array(ABOVE), 0.8 + 0.05 * np.arange(len(STEPS))
+    return np.stack([0.1 + 0 * level, level - 0.3, 4 * above - 1.3 * rates, rates])
 
 
 def test_a_motion_slides_along_borders_of_every_kind():

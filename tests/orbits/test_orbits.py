@@ -25,6 +25,7 @@ def _bodies(q, v):
 
 
 BODIES = lagjax.System(_bodies)
+HOLE = lagjax.System(lambda q, v: 0.5 * v @ v + 1 / (jnp.sqrt(q @ q) - 2))
 
 
 def eight():
@@ -131,10 +132,9 @@ def test_the_figure_of_eight():
 
 def test_the_innermost_stable_circle():
     # About V = −1/(r − 2) circles have E = −1/(r − 2) + r/(2 (r − 2)²), least at r = 6, within which none is stable.
-    hole = lagjax.System(lambda q, v: 0.5 * v @ v + 1 / (jnp.sqrt(q @ q) - 2))
     radius, speed = 6.1, np.sqrt(6.1) / 4.1
-    circle = lagjax.periodic_orbit(hole, np.array([radius, 0.0]), np.array([0.0, speed]), 2 * np.pi * radius / speed)
-    circles = lagjax.family(hole, circle, until=-0.1, step=2.0, count=8)
+    circle = lagjax.periodic_orbit(HOLE, np.array([radius, 0.0]), np.array([0.0, speed]), 2 * np.pi * radius / speed)
+    circles = lagjax.family(HOLE, circle, until=-0.1, step=2.0, count=8)
     r = np.linalg.norm(circles.q0, axis=1)
     np.testing.assert_allclose(circles.energy, -1 / (r - 2) + r / (2 * (r - 2) ** 2), atol=1e-12)
     assert np.min(circles.energy) > -1 / 16 - 1e-12

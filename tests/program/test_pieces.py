@@ -110,7 +110,7 @@ def test_jumps(name):
             lambda q, v: 0.5 * v * v - 0.5 * q * q, forces=lambda q, v, params, jump=jump: -params * jump(2 * q + 0.4)
         )
         end = lambda k, scene=scene: lagjax.simulate(scene, 2.0, 0.4, ts, k, solver=lagjax.MachineCode()).q[-1]
-        ends.append(jax.value_and_grad(end)(0.3))
+        ends.append(jax.jit(jax.value_and_grad(end))(0.3))
     np.testing.assert_allclose(*ends, rtol=1e-7, atol=1e-7)
 
 

@@ -42,7 +42,7 @@ def repeat_on_host(x, c, t, rows):
 def given():
     random = np.random.default_rng(5)
     rows = random.normal(size=(6, 4))
-    return jnp.array([0.3, 0.8, -0.5]), jnp.array(random.normal(size=3)), jnp.array(0.2), jnp.array(rows)
+    return np.array([0.3, 0.8, -0.5]), random.normal(size=3), np.array(0.2), rows
 
 
 def weigh(repeat, rows, x, c, t):
@@ -66,7 +66,7 @@ def weigh(repeat, rows, x, c, t):
 def test_derivatives(given, transform):
     *state, rows = given
     found = transform(functools.partial(weigh, repeat_on_host, rows))(*state)
-    right = transform(functools.partial(weigh, repeat_by_scan, rows))(*state)
+    right = jax.jit(transform(functools.partial(weigh, repeat_by_scan, rows)))(*state)
     jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-11, atol=1e-12), found, right)
 
 
@@ -74,21 +74,21 @@ def test_derivatives(given, transform):
 def test_members(given, second):
     """Members have rounds of their own number, and what they share is shared."""
     x, c, t, rows = given
-    counts, starts = np.array([0, 6, 2]), c * jnp.array([[1.0], [0.5], [-0.7]])
+    counts, starts = np.array([0, 6, 2]), c * np.array([[1.0], [0.5], [-0.7]])
     derive = jax.hessian if second else jax.grad
 
     def on_host(x, c, count):
         (c, t_end), (written,), (total,) = REPETITION((x,), (c, t), (rows,), count)
         return jnp.sum(c**2) + t_end + jnp.sum(written) + jnp.sum(total**2)
 
-    found = jax.vmap(derive(on_host), (None, 0, 0))(x, starts, counts)
+    found = jax.jit(jax.vmap(derive(on_host), (None, 0, 0)))(x, starts, counts)
     for member, count in enumerate(counts):
 
         def by_scan(x, count=int(count), start=starts[member]):
             c, t_end, written, total = repeat_by_scan(x, start, t, rows[:count])
             return jnp.sum(c**2) + t_end + jnp.sum(written) + jnp.sum(total**2)
 
-        np.testing.assert_allclose(found[member], derive(by_scan)(x), rtol=1e-11, atol=1e-12)
+        np.testing.assert_allclose(found[member], jax.jit(derive(by_scan))(x), rtol=1e-11, atol=1e-12)
 
 
 def test_lost_derivatives():
@@ -123,9 +123,10 @@ FUNCTIONS = {
 def test_operations(name):
     """Members in front, or one row that all share, give what JAX gives of each."""
     function, rows = FUNCTIONS[name], np.random.default_rng(2).normal(size=(3, 3))
+    compiled = jax.jit(function)
     on_host = HostFunction(function, jax.ShapeDtypeStruct((3,), float))
     for x in (rows, rows[:1]):
-        right = np.stack([function(jnp.array(row)) for row in x])
+        right = np.stack([compiled(row) for row in x])
         np.testing.assert_allclose(on_host(x)[0], np.broadcast_to(right, on_host(x)[0].shape), rtol=1e-14)
         assert on_host(x)[0].dtype == right.dtype
 
@@ -159,5 +160,5 @@ def test_places_that_are_known_at_run_time(read):
         return [found, *pull(jnp.sin(found))]
 
     on_host = HostFunction(both, jax.ShapeDtypeStruct(shape, float), jax.ShapeDtypeStruct(of_places, int))
-    for found, right in zip(on_host(x, places), jax.vmap(both)(x, places), strict=True):
+    for found, right in zip(on_host(x, places), jax.jit(jax.vmap(both))(x, places), strict=True):
         np.testing.assert_allclose(found, right, rtol=1e-14)

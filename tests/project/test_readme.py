@@ -25,11 +25,16 @@ def shape_of(printed: str) -> str:
     return " ".join(re.sub(r"[-+]?\d[\d.]*(e[-+]?\d+)?", "#", printed).split())
 
 
-def test_readme_code(capsys, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "pages",
+    [[], pytest.param(GUIDE, marks=pytest.mark.slow)],  # ten pages, which take five times as long as the README
+    ids=["README", "and the guide"],
+)
+def test_readme_code(pages, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # One session, as a reader would type it; what a block prints is what the page shows right after it.
     session, prints = {}, 0
-    for page in (ROOT / "README.md", *GUIDE):
+    for page in (ROOT / "README.md", *pages):
         text = page.read_text()
         shown = re.findall(r"```python\n(.*?)```(?:\n\n```text\n(.*?)```)?", text, flags=re.DOTALL)
         assert len(shown) == len(blocks(text))
@@ -37,7 +42,7 @@ def test_readme_code(capsys, tmp_path, monkeypatch):
             exec(compile(code, page.name, "exec"), session)
             assert shape_of(capsys.readouterr().out) == shape_of(printed)
             prints += bool(printed)
-    assert prints > 5
+    assert prints > (5 if pages else 1)
 
 
 def test_the_readme_is_a_front_page():

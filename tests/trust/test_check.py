@@ -89,6 +89,9 @@ def free(q, v):
     return 0.5 * jnp.sum(v**2)
 
 
+FREE = lagjax.System(free)
+
+
 def at_rest(q, v):
     return 0.5 * jnp.linalg.norm(v) * jnp.linalg.norm(v) - 0.5 * jnp.sum(q**2)
 
@@ -212,6 +215,9 @@ SINGULAR = {
     ),
     "fourth powers at rest": (lambda q, v: v**4 - q**2, 1.0, 0.0, "singular_at_velocity", {"q"}),
 }  # fmt: skip
+COUPLED = lagjax.System(lambda q, v: 0.5 * (v[0] + v[1]) ** 2 + 1e-9 * v[1] ** 2 - jnp.sum(q**2))
+STEP = lagjax.System(lambda q, v: 0.5 * v**2 - jnp.where(q > 1.25, 1.0, 0.0))
+SMOOTH = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * jnp.maximum(q - 1.25, 0.0) ** 2)
 
 
 @pytest.mark.parametrize("name", SINGULAR)
@@ -243,8 +249,7 @@ def test_signs_and_condition_of_the_mass_matrix():
     assert only(wrong).kind == "indefinite_mass_matrix" and "negative definite" in only(wrong).message and wrong.ok
     # Masses far apart are scaled away, coupled ones are not.
     assert kinds(lambda q, v: 1e9 * v[0] ** 2 + 1e-9 * v[1] ** 2 - q[0] ** 2, np.ones(2), np.ones(2)) == set()
-    coupled = lagjax.System(lambda q, v: 0.5 * (v[0] + v[1]) ** 2 + 1e-9 * v[1] ** 2 - jnp.sum(q**2))
-    finding = next(f for f in lagjax.check(coupled, np.ones(2), np.ones(2)) if f.kind == "ill_conditioned")
+    finding = next(f for f in lagjax.check(COUPLED, np.ones(2), np.ones(2)) if f.kind == "ill_conditioned")
     assert finding.where == ("q[0]", "q[1]")
 
 
@@ -290,12 +295,10 @@ def test_discontinuities_are_found_where_they_are():
     assert "at this state" in here.message
     near = only(lagjax.check(lagjax.System(free, forces=friction), 0.3, 0.4))
     assert near.level == "advice" and near.where == ("dq",)
-    step = lagjax.System(lambda q, v: 0.5 * v**2 - jnp.where(q > 1.25, 1.0, 0.0))
-    finding = only(lagjax.check(step, 1.0, 0.5))
+    finding = only(lagjax.check(STEP, 1.0, 0.5))
     assert finding.level == "advice" and "0.25 away along q" in finding.message and "where" not in finding.where
     assert "the motion is reflected" in finding.message
-    smooth = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * jnp.maximum(q - 1.25, 0.0) ** 2)
-    assert not lagjax.check(smooth, 1.0, 0.5).found
+    assert not lagjax.check(SMOOTH, 1.0, 0.5).found
 
 
 # ---- constraints -----------------------------------------------------------------------------------------------------
@@ -383,7 +386,7 @@ def test_numbers_that_are_given():
     assert {finding.where[0] for finding in findings} == {"q", "params['m']", "params['list'][1]"}
     whole = lagjax.check(lagjax.System(lambda q, v, params: params * v**2), 1.0, 0.0, params=2)
     assert only(whole).kind == "integer_parameter"
-    assert not lagjax.check(lagjax.System(free), 1e-9, 0.0).found  # the default atol is as small
+    assert not lagjax.check(FREE, 1e-9, 0.0).found  # the default atol is as small
     two = lagjax.System(lambda q, v: 0.5 * v["x"] ** 2 + 0.5 * v["angle"] ** 2)
     small = only(lagjax.check(two, {"x": 1e-9, "angle": 1.0}, {"x": 0.0, "angle": 0.0}))
     assert small.where == ("q['x']",) and "pass atol=1e-21" in small.message
@@ -399,7 +402,7 @@ def test_without_x64(monkeypatch):
 
 
 def test_refused():
-    scene = lagjax.System(free)
+    scene = FREE
     with pytest.raises(TypeError, match=r"write 1\.0 instead of 1"):
         lagjax.check(scene, 1, 0)
     with pytest.raises(ValueError, match="one number; got shape"):
@@ -417,7 +420,7 @@ def test_findings_are_frozen_sorted_and_fit_a_screen():
     assert levels == sorted(levels, key=["error", "warning", "advice"].index) and len(set(levels)) == 3
     text = str(findings)
     assert len(text.splitlines()) <= 48 and max(map(len, text.splitlines())) <= 110 and "more" in text
-    assert str(lagjax.check(lagjax.System(free), 1.0, 0.0)) == "Nothing found."
+    assert str(lagjax.check(FREE, 1.0, 0.0)) == "Nothing found."
     with pytest.raises(AttributeError):
         findings.found = ()
 

@@ -46,6 +46,11 @@ SCENES = (
     scenes.rolling_cylinder, scenes.cartesian_double_pendulum, scenes.chaplygin_sleigh, scenes.charge_in_fields,
     scenes.relativistic_charge_in_electric_field, scenes.kepler, scenes.figure_eight,
 )  # fmt: skip
+CARRIED = lagjax.System(
+    lagrangians.free_particles, dissipation=lambda q, v: 0.1 * jnp.sum(v**2),
+    velocity_constraints=lambda q, v, t: v[0] - jnp.sin(t),
+)  # fmt: skip
+FALL = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2 - jnp.log(2.0 - q) * params["c"])
 
 
 @pytest.mark.parametrize("make", sweep(SCENES, KINDS), ids=lambda make: make.__name__)
@@ -181,11 +186,7 @@ def test_work_of_constraints_that_move():
     np.testing.assert_allclose(np.ptp(np.asarray(trajectory.energy())), gained, rtol=1e-7)
     assert health.works and health.energy.value < 1e-9 * gained
     # A platform that carries a skater along: its constraint asks for a velocity, and pays for the friction.
-    carried = lagjax.System(
-        lagrangians.free_particles, dissipation=lambda q, v: 0.1 * jnp.sum(v**2),
-        velocity_constraints=lambda q, v, t: v[0] - jnp.sin(t),
-    )  # fmt: skip
-    skating = lagjax.simulate(carried, np.zeros(2), np.array([0.0, 1.0]), ts).health()
+    skating = lagjax.simulate(CARRIED, np.zeros(2), np.array([0.0, 1.0]), ts).health()
     assert skating.works and skating.energy.value < 1e-8 and flagged(skating) == set()
 
 
@@ -316,16 +317,15 @@ def test_references_that_cannot_be_compared():
 
 def test_members_that_failed_do_not_spoil_the_others():
     # q″ = −k q + c/(2 − q): the member that starts beside q = 2 falls into it, one has no parameter.
-    fall = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2 - jnp.log(2.0 - q) * params["c"])
     q0, k = jnp.array([0.1, 1.9, 0.2, 0.3]), jnp.array([1.0, 1.0, jnp.nan, 2.0])
     batch = lagjax.simulate_batch(
-        fall, q0, np.zeros(4), TS, {"k": k, "c": np.full(4, 0.5)}, batch_axes=(0, 0, {"k": 0, "c": 0})
+        FALL, q0, np.zeros(4), TS, {"k": k, "c": np.full(4, 0.5)}, batch_axes=(0, 0, {"k": 0, "c": 0})
     )
     assert batch.ok.tolist() == [True, False, False, True]
     health = batch.health()
     assert health.suspicious.tolist() == [False, True, True, False]
     for i in (0, 3):
-        alone = lagjax.simulate(fall, q0[i], 0.0, TS, {"k": k[i], "c": 0.5}).health()
+        alone = lagjax.simulate(FALL, q0[i], 0.0, TS, {"k": k[i], "c": 0.5}).health()
         np.testing.assert_allclose(health.energy.value[i], alone.energy.value, rtol=1e-6, atol=1e-15)
         np.testing.assert_allclose(health.energy_allowed[i], alone.energy_allowed, rtol=1e-9)
         np.testing.assert_allclose(health.condition.value[i], alone.condition.value, rtol=1e-12)

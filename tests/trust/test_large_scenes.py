@@ -33,6 +33,10 @@ def lattice(q, qdot, t, params):
 
 
 RING = lagjax.System(lattice)
+CHAIN = lagjax.System(
+    lambda q, qdot: 0.5 * jnp.sum(qdot**2) - jnp.sum(q[:, 1]),
+    constraints=lambda q: jnp.sum(jnp.diff(q, axis=0) ** 2, axis=1) - 1.0,
+)
 
 
 def numbers(**changed):
@@ -128,15 +132,11 @@ def test_a_motion_that_fails_names_the_coordinate():
 def test_a_start_off_one_of_many_constraints_is_named():
     count = 80
     q = np.stack([np.arange(count) * 1.0, np.zeros(count)], axis=1)
-    chain = lagjax.System(
-        lambda q, qdot: 0.5 * jnp.sum(qdot**2) - jnp.sum(q[:, 1]),
-        constraints=lambda q: jnp.sum(jnp.diff(q, axis=0) ** 2, axis=1) - 1.0,
-    )
     off = q + 1e-3 * (np.arange(count) > 41)[:, None] * [1.0, 0.0]
     with pytest.raises(ValueError, match=r"does not satisfy constraints\[41\]"):
-        lagjax.simulate(chain, off, np.zeros_like(q), TS)
+        lagjax.simulate(CHAIN, off, np.zeros_like(q), TS)
     with pytest.raises(ValueError, match=r"constraints\[41\] has zero gradient"):
-        lagjax.simulate(chain, q - (np.arange(count) > 41)[:, None] * [1.0, 0.0], np.zeros_like(q), TS)
+        lagjax.simulate(CHAIN, q - (np.arange(count) > 41)[:, None] * [1.0, 0.0], np.zeros_like(q), TS)
 
 
 @pytest.mark.parametrize("kind", ["band", pytest.param("blocks", marks=pytest.mark.slow)])

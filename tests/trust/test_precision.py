@@ -13,6 +13,7 @@ TS = np.linspace(0.0, 10.0, 21)
 TOLERANCES = (1e-4, 1e-7, 1e-10)
 DEFAULT = "default: Taylor (machine code)"
 SOLVERS = {DEFAULT: None, "Dopri8": lagjax.FineOutput(diffrax.Dopri8()), "Tsit5": diffrax.Tsit5()}
+BY_ARRAYS = lagjax.System(oscillator, path="array")
 
 
 @pytest.fixture(scope="module")
@@ -80,9 +81,8 @@ def test_the_engine_that_runs_by_default_is_taken_by_name_or_by_insisting():
 
 
 def test_where_diffrax_runs_by_default_it_is_named_so_and_measured_once():
-    by_arrays = lagjax.System(oscillator, path="array")
     for scene, names in (
-        (by_arrays, ["default: Dopri8", "Tsit5"]),
+        (BY_ARRAYS, ["default: Dopri8", "Tsit5"]),
         (OSCILLATOR, ["default: Taylor (machine code)", "Dopri8", "Tsit5"]),
     ):
         result = lagjax.work_precision(scene, 1.0, 0.0, TS, tolerances=[1e-4], repeats=1)

@@ -37,6 +37,10 @@ def force(q, qdot, t, params):
 
 
 SCENE = lagjax.System(lagrangian, forces=force)
+BLOCK = lagjax.System(
+    lambda q, v: 0.5 * v @ v - 9.0 * q[1], contacts=lambda q: {"floor": q[1]},
+    forces=lambda q, v, multipliers: jnp.array([0.0, -multipliers["floor"] ** 2]),
+)  # fmt: skip
 
 
 def names(result):
@@ -247,10 +251,6 @@ def test_a_motion_that_stops_in_contact_names_what_touches():
 
 def test_a_law_without_a_normal_force_is_named_and_not_the_start():
     """λ = 9 + λ²: none."""
-    block = lagjax.System(
-        lambda q, v: 0.5 * v @ v - 9.0 * q[1], contacts=lambda q: {"floor": q[1]},
-        forces=lambda q, v, multipliers: jnp.array([0.0, -multipliers["floor"] ** 2]),
-    )  # fmt: skip
     with pytest.raises(lagjax.SimulationError, match="No multipliers satisfy the law of forces") as caught:
-        lagjax.simulate(block, jnp.zeros(2), jnp.zeros(2), TS)
+        lagjax.simulate(BLOCK, jnp.zeros(2), jnp.zeros(2), TS)
     assert "q0" not in str(caught.value)
