@@ -171,7 +171,7 @@ class _Parts:
             self.bodies.append("".join(f"    {statement}\n" for statement in self.text))
 
     def _find_inlined(self) -> list[bool]:
-        """Whether each node stands where it is used: constants, and arithmetic of one use."""
+        """Flags of the nodes that stand where they are used: constants, and arithmetic of one use."""
         nodes, size = self.line.nodes, [1] * len(self.line.nodes)
         inlined, repeated = [False] * len(nodes), set(self.line.outputs)
         for op, operands, _ in nodes:
