@@ -43,7 +43,7 @@ def find_states(run: Trajectory, t) -> State:
     own = lambda x: library.asarray(x).reshape(-1, *jnp.shape(x)[len(batch) :])  # noqa: E731
     flat = jax.tree.map(own, (run.q, run.qdot, run.mode))
     states = times, *_states_at_places(run, settings, places, flat)
-    states = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[2:]), states)
+    states = jax.tree.map(lambda x: x.reshape((*shape, *x.shape[2:])), states)
     return State(*(jax.device_put(states) if library is np else states))
 
 
