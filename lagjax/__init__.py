@@ -6,7 +6,8 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 
 **Motion**
 
-- `System`: L, constraints, forces, dissipation, contacts; `System.explain` tells what is in it
+- `System`: L, constraints, forces, dissipation, contacts; `System.explain` tells what is in it,
+  `System.equations` prints its `Equations`, `System.to_c` writes them in C
 - `simulate`, `simulate_batch`: one motion, or many at once, as a `Trajectory` of `State`s; with contacts its `Impacts`
   and `ContactChanges`
 - `samples`: an input that was measured, as a function of time
@@ -23,7 +24,8 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 
 **What a scene does**
 
-- `equilibrium`, `linearize`, `normal_modes`: at rest and near it: `Equilibrium`, `Linearization`, `Modes`
+- `equilibrium`, `steady_motion`, `linearize`, `normal_modes`: at rest or rolling on, and near it: `Equilibrium`,
+  `SteadyMotion`, `Linearization` (`ReducedLinearization`), `Modes`
 - `conserved_quantities`, `noether_charge`, `cyclic_coordinates`: symmetries: `ConservedQuantities`, each `Conserved`
 - `same_motion`: whether two Lagrangians have one motion, as `SameMotion`
 - `change_coordinates`, `hamiltonian`, `routhian`: the scene written otherwise: `ChangedCoordinates`, `Hamiltonian` with
@@ -75,6 +77,7 @@ if TYPE_CHECKING:  # each is imported on first use: all of them take as long as 
         normal_modes,
         routhian,
         same_motion,
+        steady_motion,
     )
     from lagjax._analysis.orbits import (
         action,
@@ -121,8 +124,8 @@ __all__ = [
     "between", "branch_off", "change_coordinates", "check", "conserved_quantities", "crossings", "cyclic_coordinates",
     "designs", "equilibrium", "family", "find_path", "fit", "hamiltonian", "inertia", "linearize", "lyapunov_exponent",
     "lyapunov_spectrum", "noether_charge", "normal_modes", "per_record", "periodic_orbit", "plot", "positive",
-    "results", "routhian", "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch", "sweep",
-    "work_precision", "wrapped",
+    "results", "routhian", "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch",
+    "steady_motion", "sweep", "work_precision", "wrapped",
 ]  # fmt: skip
 
 
@@ -151,6 +154,12 @@ def _load_contacts():
     return contacts
 
 
+def _load_run():
+    from lagjax import _run
+
+    return _run
+
+
 register(
     Registered(
         summary=lambda run: _load_show().summary(run),
@@ -159,9 +168,12 @@ register(
         frame=lambda run, units, time_unit: _load_show().frame(run, units, time_unit),
         impact_frame=lambda impacts: _load_show().impact_frame(impacts),
         change_frame=lambda changes: _load_show().change_frame(changes),
+        write_equations=lambda *scene: _load_show().write_equations(*scene),
+        write_c=lambda *scene: _load_show().write_c(*scene),
         make_animation=lambda run, points, *look: _load_show().make_animation(run, points, *look),
         examine=lambda run, reference: _load_health().examine(run, reference),
         contact_forces=lambda run, name: _load_contacts().contact_forces(run, name),
+        find_states=lambda run, t: _load_run().find_states(run, t),
         describe_failure=lambda run, layout, why: _load_trust().describe_failure(run, layout, why),
     )
 )

@@ -14,6 +14,7 @@ import dataclasses
 import functools
 import inspect
 from collections.abc import Callable
+from fractions import Fraction
 from typing import Any
 
 import jax
@@ -23,28 +24,36 @@ import numpy as np
 from lagjax._analysis import Modes
 from lagjax._fit import Fit, Record, draw_record
 from lagjax._interface import Function, Layout, accept, join_names
-from lagjax._run import Crossings, Impacts, Members, Trajectory
+from lagjax._run import Crossings, Impacts, Members, Trajectory, simulate
+from lagjax._run.hybrid import Hybrid
+from lagjax._scene import System
 from lagjax._show import (
     COLORS,
     columns_of,
     course_of,
     courses_of,
+    draw_curves,
     even_places,
     import_package,
     join_curve,
     require_numbers,
     require_points,
     simplify_axes,
+    spans_of,
+    spread_prefix,
+    wrap_curve,
 )
+from lagjax._sweep import axes_of
 from lagjax._trust import WorkPrecision
 from lagjax._trust.health import does_work
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 GREY = "0.55"
+STRIP = 0.04  # of the height of axes, for what one contact does
 
 __all__ = [
-    "compare", "energy_error", "fit", "modes", "path", "phase", "poincare", "profile", "return_map", "space_time",
-    "state_map", "trajectory", "work_precision",
+    "bifurcation", "compare", "energy_error", "fit", "modes", "path", "phase", "poincare", "profile", "return_map",
+    "space_time", "state_map", "trajectory", "work_precision",
 ]  # fmt: skip
 
 
@@ -53,55 +62,74 @@ def __dir__() -> list[str]:
     return [*__all__, *(name for name in globals() if name.startswith("__"))]
 
 
-def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, members: int = 30, ax=None):
+def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, members: int = 30, period: Any = None,
+               ax=None):  # fmt: skip
     """Coordinates against time, one colour each, the first seven of more; or, with a `projection`, curves in the plane.
 
     Between two outputs curves are the cubic that has q and q̇ of both (Hermite); of a hybrid motion they go through the
     states before and after every transition, and end where a reset moves what is drawn. `space_time` shows all
-    coordinates of a chain or a lattice. Marks at the lower edge are the impacts of contacts, one kind for each.
+    coordinates of a chain or a lattice. One hybrid motion has its modes shaded. At the lower edge stand the contacts,
+    one above the other: marks are their impacts, and of one motion spans are the times during which they are closed.
 
     - `projection`: a function of one state, (q, qdot) or q alone, that returns (x, y): `lambda q, qdot: (q, qdot)` for
       the phase portrait of one coordinate, or where a body is in space.
     - `members`: of a batch, draw this many, evenly chosen.
+    - `period`: 2π for angles: they are drawn from −π to π, lines that leave there come in again, and ticks are parts of
+      π. A number for all coordinates, or a pytree prefix of q with None where there is none; of a `projection` the
+      number for x, or a pair for x and y.
 
     >>> lagjax.plot.trajectory(trajectory); lagjax.plot.trajectory(trajectory, lambda q, qdot: (q[0], qdot[0]))
     """
-    layout, curves = _curves(trajectory, members)
-    ax, opacity = _axes(ax), max(0.15, len(curves) ** -0.5)
+    (layout, curves), ax = _curves(trajectory, members), _axes(ax)
     if projection is not None:
-        for x, y in _project(layout, curves, projection):
-            ax.plot(*join_curve(x, y), color=COLORS[0], alpha=opacity, linewidth=1.2)
+        periods = _pair_of_periods(period, ax)
+        projected = _project(layout, curves, projection)
+        draw_curves(ax, [join_curve(*wrap_curve(*line, *periods)) for line in projected], COLORS[0])
         return ax
-    shown = _places(layout, ())
+    shown, periods = _places(layout, ()), _periods(layout, period)
     for color, i in zip(COLORS, shown, strict=False):
-        for t, q, _ in curves:
-            ax.plot(*join_curve(t, q[:, i]), color=color, alpha=opacity, linewidth=1.5)
-        ax.lines[-len(curves)].set_label(layout.names[i])
+        lines = [join_curve(*wrap_curve(t, q[:, i], None, periods[i])) for t, q, _ in curves]
+        draw_curves(ax, lines, color, layout.names[i], 1.5)
+    _draw_angles(ax.yaxis, [periods[i] for i in shown])
     ax.set_xlabel("t")
+    shaded = _shade_spans(ax, trajectory)
     marked = trajectory.impacts is not None and _mark_impacts(ax, trajectory.impacts, members)
     if layout.size == 1:
         ax.set_ylabel(layout.names[0])
-        return _legend(ax) if marked else ax
+        return _legend(ax) if marked or shaded else ax
     return _legend(ax, len(shown), layout)
+
+
+def _shade_spans(ax, trajectory: Trajectory) -> bool:
+    """Spans of the modes of one motion, at the lower edge of closed contacts, seven of either; False without any."""
+    spans = spans_of(trajectory) if np.size(trajectory.ok) == 1 else {}
+    for k, (color, (name, times)) in enumerate(zip(reversed(COLORS), spans.items(), strict=False)):
+        low, high, opacity = (STRIP * k, STRIP * (k + 1), 0.4) if trajectory.mode is None else (0.0, 1.0, 0.12)
+        for label, (first, last) in zip([name, *["_"] * len(times)], times, strict=False):
+            ax.axvspan(first, last, low, high, color=color, alpha=opacity, linewidth=0, zorder=0, label=label)
+    return any(spans.values())
 
 
 def _mark_impacts(ax, impacts: Impacts, members: int) -> bool:
     """Marks at the lower edge for the impacts of each contact, the first seven of more; False without any."""
-    t = np.atleast_2d(impacts.t)
+    t, before = np.atleast_2d(impacts.t), len(ax.lines)
     t = t.reshape(-1, t.shape[-1])
-    chosen, markers = even_places(len(t), members), iter(MARKERS)
-    for name, impulses in columns_of({"impact": impacts.impulse}, np.ndim(impacts.t)).items():
+    chosen, columns = even_places(len(t), members), columns_of({"impact": impacts.impulse}, np.ndim(impacts.t))
+    for row, (marker, (name, impulses)) in enumerate(zip(MARKERS, columns.items(), strict=False)):
         when = t[chosen][impulses.reshape(t.shape)[chosen] > 0]
-        if len(when) and (marker := next(markers, None)):
+        if len(when):
             at_edge = dict(transform=ax.get_xaxis_transform(), color=GREY, linestyle="none", markersize=4)
-            ax.plot(when, np.full(len(when), 0.02), marker=marker, label=name, **at_edge)
-    return next(markers, None) != MARKERS[0]
+            ax.plot(when, np.full(len(when), STRIP * (row + 0.5)), marker=marker, label=name, **at_edge)
+    return len(ax.lines) > before
 
 
-def space_time(trajectory: Trajectory, *, label: str | None = None, cmap: str = "viridis", ax=None):
+def space_time(trajectory: Trajectory, row: str | None = None, *, period: float | None = None, label: str | None = None,
+               cmap: str | None = None, ax=None):  # fmt: skip
     """All coordinates of one motion against time, by colour: waves along a chain, or in the modes of a field.
 
-    - `label`: what the colour bar is called; by default "q".
+    - `row`: one array of coordinates, by its name: "q['u']"; or of velocities, "qdot['u']".
+    - `period`: 2π for angles: colours go around with them, and the ticks of the colour bar are parts of π.
+    - `label`: what the colour bar is called; by default "q", or the row.
 
     The coordinates stand above each other, in the order in which messages name them; every output time is the middle
     of its column.
@@ -110,38 +138,45 @@ def space_time(trajectory: Trajectory, *, label: str | None = None, cmap: str = 
     """
     _require_numbers(trajectory, "trajectory")
     layout, course = course_of(trajectory)
-    ax = _axes(ax)
-    places, values = np.arange(layout.size), np.ma.masked_invalid(course.q.T)
-    mesh = ax.pcolormesh(course.t, places, values, cmap=cmap, shading="nearest", rasterized=True)
+    kind, names = ("qdot" if row and row.startswith("qdot") else "q"), list(layout.names)
+    names = [kind + name.removeprefix("q") for name in names]
+    chosen = [i for i, name in enumerate(names) if row in (None, kind, name) or name.startswith(f"{row}[")]
+    if not chosen:
+        raise ValueError(f"There is no row {row!r}; there are {join_names(layout.paths)}, and their velocities.")
+    ax, values = _axes(ax), np.ma.masked_invalid(getattr(course, kind).T[chosen])
+    style = dict(cmap=cmap or "viridis")
+    if period is not None:
+        _require_period(period)
+        values = _wrap(values, period)
+        style = dict(cmap=cmap or "twilight", vmin=-period / 2, vmax=period / 2)
+    mesh = ax.pcolormesh(course.t, np.arange(len(chosen)), values, shading="nearest", rasterized=True, **style)
     ax.set(xlabel="t", ylabel="coordinate")
     ax.locator_params(axis="y", integer=True)
-    if layout.size <= len(COLORS):
-        ax.set_yticks(np.arange(layout.size), layout.names)
+    if len(chosen) <= len(COLORS):
+        ax.set_yticks(np.arange(len(chosen)), [names[i] for i in chosen])
     ax.grid(False)
-    _colorbar(mesh, ax, "q" if label is None else label)
+    _draw_angles(_colorbar(mesh, ax, label or row or "q").ax.yaxis, [period])
     return ax
 
 
-def phase(trajectory: Trajectory, *coordinates: str, members: int = 30, ax=None):
+def phase(trajectory: Trajectory, *coordinates: str, members: int = 30, period: Any = None, ax=None):
     """The phase portrait: the velocity of each coordinate against it, from the dot on; a colour for each coordinate.
 
     The curves are those of `trajectory`: they end at a reset, and continue behind it.
 
     - `coordinates`: their names, as messages and tables have them: "q['theta']", "q[0]"; by default all, the first
       seven of more.
-    - `members`: of a batch, draw this many, evenly chosen.
+    - `members`, `period`: as in `trajectory`.
 
     >>> lagjax.plot.phase(trajectory, "q['theta']")
     """
-    layout, curves = _curves(trajectory, members)
-    places = _places(layout, coordinates)
-    ax, opacity = _axes(ax), max(0.15, len(curves) ** -0.5)
+    (layout, curves), ax = _curves(trajectory, members), _axes(ax)
+    places, periods = _places(layout, coordinates), _periods(layout, period)
     for color, i in zip(COLORS, places, strict=False):
-        for _, q, qdot in curves:
-            ax.plot(q[:, i], qdot[:, i], color=color, alpha=opacity, linewidth=1.2)
-        ax.lines[-len(curves)].set_label(layout.names[i])
-        starts = np.array([(q[0, i], qdot[0, i]) for _, q, qdot in curves])
-        ax.plot(*starts.T, ".", color=color, markersize=5)
+        lines = [wrap_curve(q[:, i], qdot[:, i], periods[i]) for _, q, qdot in curves]
+        draw_curves(ax, lines, color, layout.names[i])
+        ax.plot(*np.array([(x[0], y[0]) for x, y in lines]).T, ".", color=color, markersize=5)
+    _draw_angles(ax.xaxis, [periods[i] for i in places])
     if len(places) == 1:
         name = layout.names[places[0]]
         ax.set(xlabel=name, ylabel="qdot" + name.removeprefix("q"))
@@ -328,24 +363,25 @@ def path(x, y, *, values=None, label: str | None = None, cmap: str = "viridis", 
     return ax
 
 
-def poincare(crossings: Crossings, projection: Callable, *, values=None, label: str | None = None, size=None, ax=None):
+def poincare(crossings: Crossings, projection: Callable, *, values=None, label: str | None = None, size=None,
+             period: Any = None, ax=None):  # fmt: skip
     """A Poincaré section: a point for every crossing, of one motion or of a batch; a batch has a colour per member.
 
     - `projection`: a function of one state (q, qdot) that returns (x, y), the coordinates on the section.
     - `values`: shape (N,), one number per member of a batch, such as its energy or its Lyapunov exponent, by which
       points are coloured instead, with a colour bar called `label`. `size` is that of the points, by default as suits
       how many there are.
+    - `period`: 2π where x is an angle, or a pair for x and y with None for what is none, as in `trajectory`.
 
     >>> lagjax.plot.poincare(crossings, lambda q, qdot: (q[1], qdot[1]))
     """
     x, y, members = _section_points(crossings, projection)
     ax = _axes(ax)
-    size = np.clip(2e4 / max(1, len(x)), 0.02, 9.0) if size is None else size
-    style: dict[str, Any] = dict(s=size, linewidths=0, rasterized=True)
+    x, y = map(_wrap, (x, y), _pair_of_periods(period, ax))
     if values is None:
-        ax.scatter(x, y, c=np.array(COLORS)[members % len(COLORS)], **style)
+        _scatter(ax, x, y, np.array(COLORS)[members % len(COLORS)], size)
         return ax
-    points = ax.scatter(x, y, c=np.asarray(values)[members], cmap="viridis", **style)
+    points = _scatter(ax, x, y, np.asarray(values)[members], size, cmap="viridis")
     _colorbar(points, ax, label)
     return ax
 
@@ -360,7 +396,7 @@ def return_map(crossings: Crossings, value: Callable, *, ax=None):
     ax = _axes(ax)
     x, _, members = _section_points(crossings, lambda q, qdot: (value(q, qdot), value(q, qdot)))
     same = members[1:] == members[:-1]
-    ax.scatter(x[:-1][same], x[1:][same], s=np.clip(2e4 / max(1, len(x)), 0.02, 9.0), color=COLORS[0], linewidths=0)
+    _scatter(ax, x[:-1][same], x[1:][same], COLORS[0])
     low, high = (float(end) for end in (x.min(initial=0.0), x.max(initial=0.0)))
     ax.plot([low, high], [low, high], color=GREY, linewidth=0.8)
     ax.set(xlabel="at one crossing", ylabel="at the next")
@@ -380,6 +416,72 @@ def _section_points(crossings: Crossings, projection: Callable) -> tuple[np.ndar
     there = np.isfinite(t.ravel())
     members = np.repeat(np.arange(t.size // t.shape[-1]), t.shape[-1])
     return x[there], y[there], members[there]
+
+
+def bifurcation(system, over, strobe=None, q0=0.0, qdot0=0.0, params=None, *, value: Callable | None = None,
+                transient: int = 200, points: int = 100, period: float | None = None, ax=None):  # fmt: skip
+    """A bifurcation diagram: where a driven motion is once in every period of its drive, over a parameter.
+
+    All members are one batch; members that fail are left out. Call it again with the same `ax` and another start for an
+    attractor that is there as well.
+
+    - `system`: a `System` or a `Hybrid`; or the values (V,) of a parameter, and for `over` the points (V, …), such as
+      a `Sweep` has kept.
+    - `over`: a dict with one name and its values (V,), as in `sweep`.
+    - `strobe`: the period of the drive. Seen are the states at `transient` + 1 to `transient` + `points` times it.
+    - `strobe`, `q0`, `qdot0`, `params`: values, or functions of one member's point, a dict with its value by the name.
+      Where `params` is a dict with that name, its entry is the value.
+    - `value`: a function of one state (q, qdot) that returns the number to draw; by default the first coordinate.
+    - `period`: 2π where that is an angle: it is drawn from −π to π, with parts of π as ticks.
+
+    >>> lagjax.plot.bifurcation(scene, {"drive": np.linspace(0.9, 1.5, 1000)}, 2 * np.pi / 0.7, params=params)
+    """
+    if isinstance(system, System | Hybrid):
+        x, y, names = _stroboscopic_points(system, over, (strobe, q0, qdot0, params), value, transient, points)
+    else:
+        names = [getattr(of, "name", None) or name for of, name in ((system, "parameter"), (over, "value"))]
+        x, y = np.asarray(system, float), np.asarray(over, float)
+        if x.ndim != 1 or y.shape[:1] != x.shape:
+            raise ValueError(f"Points (V, …) belong to values (V,) of a parameter; got {y.shape} and {x.shape}.")
+    x, y = np.broadcast_to(x[:, None], (len(x), y[0].size)).ravel(), y.ravel()
+    x, y = x[known := np.isfinite(y)], y[known]
+    if not len(x):
+        raise ValueError("No member has a finite point: simulate one of them, whose message says why.")
+    ax = _axes(ax)
+    _scatter(ax, x, _wrap(y, period), COLORS[len(ax.collections) % len(COLORS)])
+    _draw_angles(ax.yaxis, [period if period is None else _require_period(period)])
+    ax.set(xlabel=names[0], ylabel=names[1])
+    return ax
+
+
+def _stroboscopic_points(scene, over, start: tuple, value: Callable | None, transient, points):
+    """The values (V,) of the parameter, the points (V, P) of its members, and the names of both."""
+    axes = axes_of(over)
+    if len(axes) != 1:
+        raise ValueError(f"over must have one axis; got {join_names([axis.dimension for axis in axes])}.")
+    names, times = axes[0].names, 1 + _positive(transient, "transient", 0) + np.arange(_positive(points, "points"))
+    if start[0] is None:
+        raise ValueError("strobe is the period of the drive, 2π/ω: give it, or a function of the point.")
+    if not any(map(callable, start)) and not (isinstance(start[3], dict) and {*names} & {*start[3]}):
+        raise ValueError(f"Nothing depends on {join_names(names)}: give params as a dict with that name, or functions.")
+    columns, shown = np.concatenate([values for _, values in axes[0].pieces()]).T, []
+
+    def follow(point):
+        strobe, q0, qdot0, params = (of(point) if callable(of) else of for of in start)
+        if isinstance(params, dict) and not callable(start[3]):
+            params = params | {name: x for name, x in point.items() if name in params}
+        ts = jnp.asarray(strobe) * jnp.concatenate([jnp.zeros(1), times])
+        run = simulate(scene, q0, qdot0, ts, params, throw=False)
+        seen = jax.tree.map(lambda x: x[1:], (run.q, run.qdot))
+        if value is not None:
+            return jax.vmap(value)(*seen)
+        shown.append(Layout.from_state(*jax.tree.map(lambda x: x[0], seen)).names[0])
+        return jax.tree.leaves(seen[0])[0].reshape(len(times), -1)[:, 0]
+
+    found = jax.jit(jax.vmap(follow))(dict(zip(names, columns, strict=True)))
+    if found.shape != (columns.shape[1], len(times)):
+        raise ValueError(f"value must return one number for one state; got shape {found.shape[2:]}.")
+    return columns[0], np.asarray(found), (names[0], *(shown or ["value"]))
 
 
 def energy_error(trajectory: Trajectory, *, scale: float | None = None, ax=None):
@@ -516,6 +618,59 @@ def _axes(ax):
     return simplify_axes(ax)
 
 
+def _require_period(period) -> float:
+    if isinstance(period, bool) or np.ndim(period) or not np.isreal(period) or not 0 < period < np.inf:
+        raise ValueError(f"period must be a positive number, 2π for an angle; got {period!r}.")
+    return float(period)
+
+
+def _periods(layout: Layout, period) -> list[float | None]:
+    """The period of every coordinate, None of those that are no angles."""
+    leaves = spread_prefix(period, layout.restore(np.zeros(layout.size)), "period", "a number")
+    sizes = [int(np.prod(shape)) for shape in layout.shapes]
+    return [x if x is None else _require_period(x) for x, size in zip(leaves, sizes, strict=True) for _ in range(size)]
+
+
+def _pair_of_periods(period, ax) -> tuple[float | None, float | None]:
+    """The periods of x and y, whose axes get ticks of angles."""
+    given = period if isinstance(period, tuple) and len(period) == 2 else (period, None)
+    of_x, of_y = (None if one is None else _require_period(one) for one in given)
+    for axis, one in ((ax.xaxis, of_x), (ax.yaxis, of_y)):
+        _draw_angles(axis, [one])
+    return of_x, of_y
+
+
+def _wrap(x, period: float | None):
+    """Values in −P/2 … P/2."""
+    return x if period is None else x - period * np.floor(x / period + 0.5)
+
+
+def _draw_angles(axis, periods: list[float | None]) -> None:
+    """The limits of an axis and ticks at the quarters of the period that all of these share, as parts of π."""
+    if len({*periods}) != 1 or (period := periods[0]) is None:
+        return
+    quarters = period * np.arange(-2, 3) / 4
+    parts = [Fraction(x / np.pi).limit_denominator(24) for x in quarters]
+    in_pi = np.allclose(np.array(parts, float) * np.pi, quarters, rtol=1e-6)
+    axis.set_ticks(quarters, list(map(_name_angle, parts)) if in_pi else None)
+    if axis.axes.get_label() != "<colorbar>":
+        getattr(axis.axes, f"set_{axis.axis_name}lim")(1.02 * quarters[[0, -1]])
+
+
+def _name_angle(part: Fraction) -> str:
+    """This many π: "−π/2", "0", "3π/4"."""
+    if not part:
+        return "0"
+    whole = "" if abs(part.numerator) == 1 else str(abs(part.numerator))
+    return f"{'−' * (part < 0)}{whole}π{'' if part.denominator == 1 else f'/{part.denominator}'}"
+
+
+def _scatter(ax, x, y, colors, size: float | None = None, **more):
+    """Points whose `size` is by default what suits how many there are."""
+    size = float(np.clip(2e4 / max(1, len(x)), 0.02, 9.0)) if size is None else size
+    return ax.scatter(x, y, c=colors, s=size, linewidths=0, rasterized=True, **more)
+
+
 def _wide_figure(columns: int):
     return _matplotlib().pyplot.figure(figsize=(max(6.4, 3.6 * columns), 4.6), layout="constrained")
 
@@ -528,7 +683,9 @@ def _legend(ax, shown: int = 0, layout: Layout | None = None):
 
 
 def _colorbar(mappable, ax, label):
-    ax.figure.colorbar(mappable, ax=ax, label=label, pad=0.02).outline.set_visible(False)
+    bar = ax.figure.colorbar(mappable, ax=ax, label=label, pad=0.02)
+    bar.outline.set_visible(False)
+    return bar
 
 
 def _edges(centres) -> tuple[float, float]:
@@ -549,9 +706,9 @@ def _require_numbers(trajectory, name: str) -> None:
     require_numbers(trajectory, "lagjax.plot draws")
 
 
-def _positive(count, name: str) -> int:
-    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-        raise ValueError(f"{name} must be a whole number, one at least; got {count!r}.")
+def _positive(count, name: str, least: int = 1) -> int:
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < least:
+        raise ValueError(f"{name} must be a whole number, {('zero', 'one')[least]} at least; got {count!r}.")
     return int(count)
 
 

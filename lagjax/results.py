@@ -27,14 +27,16 @@ from lagjax._analysis import (
     Hamiltonian,
     Linearization,
     Modes,
+    ReducedLinearization,
     Routhian,
     SameMotion,
+    SteadyMotion,
 )
 from lagjax._analysis.orbits import Family, LyapunovExponent, Orbit, Path
 from lagjax._fit import Comparison, Experiments, Fit, Prediction, Profile
 from lagjax._run import ContactChanges, Crossings, Impacts, State, Trajectory, Transitions
 from lagjax._scene import Explanation
-from lagjax._show import Animation
+from lagjax._show import Animation, Equations
 from lagjax._sweep import Status, Summary
 from lagjax._trust import WorkPrecision, WorkPrecisionRow
 from lagjax._trust.checks import Finding, Findings
@@ -42,8 +44,8 @@ from lagjax._trust.health import Health
 
 __all__ = [
     "Animation", "CanonicalTrajectory", "ChangedCoordinates", "Comparison", "Conserved", "ConservedQuantities",
-    "ContactChanges", "Crossings", "Equilibrium", "Experiments", "Explanation", "Family", "Finding", "Findings", "Fit",
-    "Hamiltonian", "Health", "Impacts", "Linearization", "LyapunovExponent", "Modes", "Orbit", "Path", "Prediction",
-    "Profile", "Routhian",
-    "SameMotion", "State", "Status", "Summary", "Trajectory", "Transitions", "WorkPrecision", "WorkPrecisionRow",
+    "ContactChanges", "Crossings", "Equations", "Equilibrium", "Experiments", "Explanation", "Family", "Finding",
+    "Findings", "Fit", "Hamiltonian", "Health", "Impacts", "Linearization", "LyapunovExponent", "Modes", "Orbit", "Path",
+    "Prediction", "Profile", "ReducedLinearization", "Routhian", "SameMotion", "State", "Status", "SteadyMotion",
+    "Summary", "Trajectory", "Transitions", "WorkPrecision", "WorkPrecisionRow",
 ]  # fmt: skip

@@ -18,7 +18,7 @@ import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 from jaxtyping import Array, Float
 
-from lagjax._equations import decide
+from lagjax._equations import decide, factorize, least_norm
 
 Matrix = Float[Array, "n n"]
 
@@ -164,10 +164,22 @@ def _eigen_jvp(primals, tangents):
 # ---- spaces ----------------------------------------------------------------------------------------------------------
 
 
-def null_space(rows: Float[Array, "m n"], rank: int) -> Float[Array, "n n-rank"]:
+def _null_space(rows: Float[Array, "m n"], rank: int) -> Float[Array, "n n-rank"]:
     """An orthonormal basis, a vector a column, of what m rows of this rank send to zero; without derivatives."""
     n = rows.shape[1]
     lengths = jnp.linalg.norm(rows, axis=1, keepdims=True)
     unit = jax.lax.stop_gradient(rows / jnp.where(lengths > 0, lengths, 1))
     shape = (jax.ShapeDtypeStruct((n, n - rank), rows.dtype),)
     return _call_numpy(lambda g: _each(lambda a: [decide(a).right[:, rank:]], g), shape, unit)[0]
+
+
+def tangent_basis(jacobian: Float[Array, "m n"], rank: int) -> Float[Array, "n n-rank"]:
+    """A basis of the deviations that constraints allow; it moves with the point as little as it can."""
+    if not len(jacobian):
+        return jnp.eye(jacobian.shape[1], dtype=jacobian.dtype)
+    basis = _null_space(jacobian, rank)
+    # Zero in value, as `jacobian @ basis` is; its derivative keeps the basis on the tangent space.
+    gram, off = jacobian @ jacobian.T, jacobian @ basis
+    if rank == len(jacobian):
+        return basis - jacobian.T @ factorize(gram).solve_columns(off)
+    return basis - jacobian.T @ jax.vmap(lambda b: least_norm(gram, b), in_axes=1, out_axes=1)(off)

@@ -130,9 +130,7 @@ def equilibrium(
         require_steady(scene)
         if stable:
             scene = _settled_scene(scene, qdot)
-        place, multipliers, ok = _solve_balance(False, *scene.arguments)
-        if scene.concrete and not ok:  # with the rounding of terms, whose program is compiled where it may matter
-            place, multipliers, ok = _solve_balance(True, *scene.arguments)
+        place, _, multipliers, ok = find_balance(scene, None)
         why = "" if not throw or not scene.concrete or ok else _sentence(scene)
     if held is not None and why:
         why += " What rests on a contact is sought from where it is closed: begin at a q with a gap of zero."
@@ -147,6 +145,14 @@ def equilibrium(
     elif scene.constrained:
         of_user = scene.system._split_by_constraint(multipliers, scene.layout, scene.params)
     return Equilibrium(scene.layout.restore(place), of_user, ok, pushes)
+
+
+def find_balance(scene: SceneState, steady: "Steady | None") -> tuple[Vector, Vector, Array, Bool[Array, ""]]:
+    """q and q̇ (n,), λ (m,) and whether they are an equilibrium, or a `steady` motion."""
+    found = _solve_balance(False, steady, *scene.arguments)
+    if scene.concrete and not found[-1]:  # with the rounding of terms, whose program is compiled where it may matter
+        found = _solve_balance(True, steady, *scene.arguments)
+    return found
 
 
 def _settled_scene(scene: SceneState, qdot: PyTree) -> SceneState:
@@ -169,7 +175,8 @@ def require_steady(scene: SceneState) -> None:
     if wrong := [scene.layout.names[i] for i in np.flatnonzero(np.asarray(scene.qdot)) if i not in cyclic]:
         raise ValueError(
             f"{', '.join(wrong)}: has a velocity, but is not cyclic (L, a force or a constraint depends on it or acts "
-            "on it), so that it cannot move steadily. Give velocities to cyclic coordinates alone."
+            "on it), so that it cannot move steadily. Give velocities to cyclic coordinates alone. What rolls is for "
+            "lagjax.steady_motion, and its small motions for linearize(…).reduced(motion)."
         )
 
 
@@ -245,20 +252,48 @@ def _add_friction(system: System) -> System:
 _TINY = 1e-6  # of the other multipliers: one that counts as their rounding
 
 
+class Steady(NamedTuple):
+    """A motion that is sought: the `cyclic` coordinates (n,), of which velocities are unknown and not the place; the
+    unknowns (n,) that are `held`; and the matrices Ω of velocities that turn with each coordinate (n, n, n)."""
+
+    cyclic: Bool[Array, " n"]
+    held: Bool[Array, " n"]
+    turns: Float[Array, "n n n"]
+
+    def state(self, scene: SceneState, x: Vector) -> tuple[Vector, Vector]:
+        """(q, q̇) by the unknowns (n,)."""
+        x = jnp.where(self.held, jnp.where(self.cyclic, scene.qdot, scene.q), x)
+        return jnp.where(self.cyclic, scene.q, x), jnp.where(self.cyclic, x, 0)
+
+
 @compile_for_one_call
-def _solve_balance(has_terms: bool, *arguments) -> tuple[Vector, Array, Bool[Array, ""]]:
-    """q (n,), λ (m,) and whether they are an equilibrium; near q = 0 that is for the rounding of terms to decide."""
+def _solve_balance(has_terms: bool, steady: Steady | None, *arguments) -> tuple[Vector, Vector, Array, Array]:
+    """q and q̇ (n,), λ (m,) and whether they are an equilibrium, or a `steady` motion; near q = 0 that is for the
+    rounding of terms to decide."""
     scene = SceneState.from_arguments(*arguments)
     n = scene.layout.size
 
+    def state_of(x: Vector) -> tuple[Vector, Vector]:
+        return (x, scene.qdot) if steady is None else steady.state(scene, x)
+
+    def force_at(q: Vector, qdot: Vector) -> Vector:
+        """F − M q̈, q̈ = Σ q̇ᵢ Ωᵢ q̇."""
+        force = scene.force(q, qdot)
+        if steady is None:
+            return force
+        return force - scene.mass_matrix(q, qdot) @ jnp.einsum("i,ijk,k", qdot, steady.turns, qdot)
+
     def residual(z: Unknowns) -> Unknowns:
-        return balance(scene, z[:n], z[n:])
+        q, qdot = state_of(z[:n])
+        return balance(scene, q, qdot, force_at(q, qdot), z[n:])
 
-    def multipliers_at(q: Vector) -> Array:
-        return least_multipliers(scene.jacobian(q, scene.qdot), scene.force(q, scene.qdot))
+    def multipliers_at(q: Vector, qdot: Vector) -> Array:
+        return least_multipliers(scene.jacobian(q, qdot), force_at(q, qdot))
 
-    start = jax.lax.stop_gradient(jnp.concatenate([scene.q, multipliers_at(scene.q)]))
-    unit = _units(jax.lax.stop_gradient(scene.mass_matrix(scene.q, scene.qdot)), jax.jacfwd(residual)(start))
+    given = scene.q if steady is None else jnp.where(steady.cyclic, scene.qdot, scene.q)
+    start = jax.lax.stop_gradient(jnp.concatenate([given, multipliers_at(*state_of(given))]))
+    mass = jax.lax.stop_gradient(scene.mass_matrix(scene.q, scene.qdot))
+    unit = _units(mass, jax.jacfwd(residual)(start), True if steady is None else ~steady.cyclic)
     least = jnp.abs(start).at[n:].max(_TINY * unit[n:] * jnp.max(jnp.abs(start / unit)[n:], initial=0.0))
 
     def find(_, start):
@@ -267,29 +302,32 @@ def _solve_balance(has_terms: bool, *arguments) -> tuple[Vector, Array, Bool[Arr
         return jnp.where(jnp.abs(z) < jnp.finfo(z.dtype).eps ** 3 * jnp.abs(start), 0.0, z)
 
     z = jax.lax.custom_root(residual, start, find, lambda linear, right: shortest_preimage(linear, right, unit))
-    q = z[:n]
+    q, qdot = state_of(z[:n])
     terms: Any = 0.0
     if has_terms:
-        at = jax.lax.stop_gradient(q), scene.qdot, jnp.zeros((), q.dtype), scene.numbers
+        at = *jax.lax.stop_gradient((q, qdot)), jnp.zeros((), q.dtype), scene.numbers
         terms = ROUNDINGS * jnp.finfo(q.dtype).eps ** 0.5 * scene.derivation.term_sizes(*at, ("force", "residual"))
     ok = is_root(residual, jax.lax.stop_gradient(z), terms, least=least, power=0.5)
-    return nan_unless(ok, q), nan_unless(ok, multipliers_at(q)), ok
+    return nan_unless(ok, q), nan_unless(ok, qdot), nan_unless(ok, multipliers_at(q, qdot)), ok
 
 
-def _units(mass: Float[Array, "n n"], jacobian: Float[Array, "n+m n+m"]) -> Unknowns:
-    """A unit of each number of z, alike in all units of a user: 1/√Mᵢᵢ for qᵢ, for λ what makes as much of forces."""
+def _units(mass: Float[Array, "n n"], jacobian: Float[Array, "n+m n+m"], places: Any) -> Unknowns:
+    """A unit of each number of z, alike in all units of a user: 1/√Mᵢᵢ for qᵢ, which are `places`, for velocities and λ
+    what makes as much of forces."""
     inertia, n = jnp.abs(jnp.diagonal(mass)), len(mass)
     root = jnp.sqrt(jnp.where((inertia > 0) & jnp.isfinite(inertia), inertia, 1))
     scaled = jax.lax.stop_gradient(jacobian)[:n] / root[:, None]
-    of_q, of_multipliers = jnp.max(jnp.abs(scaled[:, :n] / root), initial=0.0), jnp.max(jnp.abs(scaled[:, n:]), axis=0)
-    found = (of_q > 0) & (of_multipliers > 0)
-    return jnp.concatenate([1 / root, jnp.where(found, of_q / jnp.where(found, of_multipliers, 1), 1)])
+    of_q = jnp.max(jnp.where(places, jnp.abs(scaled[:, :n] / root), 0.0), initial=0.0)
+    columns = jnp.max(jnp.abs(scaled), axis=0)
+    found = (of_q > 0) & (columns > 0)
+    others = jnp.where(found, of_q / jnp.where(found, columns, 1), 1)
+    return others.at[:n].set(jnp.where(places, 1 / root, others[:n]))
 
 
-def balance(scene: SceneState, q: Vector, multipliers: Array) -> Unknowns:
-    """F + Gᵀλ (n,), then the constraints on positions and a zero for each on velocities (m,): zero in equilibrium."""
-    force, jacobian = scene.force(q, scene.qdot), scene.jacobian(q, scene.qdot)
-    rows = scene.motion.constraints.residual(q, scene.qdot, jnp.zeros((), q.dtype), scene.numbers)
+def balance(scene: SceneState, q: Vector, qdot: Vector, force: Vector, multipliers: Array) -> Unknowns:
+    """F + Gᵀλ (n,) of a `force` F, then the constraints on positions and on velocities (m,): zero in equilibrium."""
+    jacobian = scene.jacobian(q, qdot)
+    rows = scene.motion.constraints.residual(q, qdot, jnp.zeros((), q.dtype), scene.numbers)
     return jnp.concatenate([force + jacobian.T @ multipliers, rows])
 
 

@@ -11,10 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax._analysis._closed_contacts import hold_closed
+from lagjax._analysis._eigen import tangent_basis
 from lagjax._analysis._equilibrium import least_multipliers
 from lagjax._analysis._scene_state import SceneState, require_matrices
 from lagjax._analysis._smoothness import is_smooth, require_smooth
-from lagjax._equations import diagonal_scale, factorize, saddle
+from lagjax._equations import diagonal_scale, factorize, null_space, saddle
 from lagjax._interface import (
     Function,
     Layout,
@@ -47,6 +48,15 @@ class LinearNames(tuple):
         names = super().__new__(cls, coordinates)
         names.inputs, names.outputs = inputs, names.states if outputs is None else outputs
         return names
+
+    def __getnewargs__(self) -> tuple:
+        return tuple(self), self.inputs, self.outputs
+
+    def __eq__(self, other: object) -> bool:
+        same = not isinstance(other, LinearNames) or self.__getnewargs__()[1:] == other.__getnewargs__()[1:]
+        return same and tuple(self) == other
+
+    __hash__ = tuple.__hash__  # pyright: ignore[reportAssignmentType]
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -84,16 +94,35 @@ class Linearization(NamedTuple):
 
     @property
     def Phi(self) -> Float[Array, "2n 2n"]:
-        return self._require_sampled()[0]
+        return self._sampled_pair[0]
 
     @property
     def Gamma(self) -> Float[Array, "2n m"]:
-        return self._require_sampled()[1]
+        return self._sampled_pair[1]
 
-    def _require_sampled(self) -> tuple[Array, Array]:
+    @property
+    def _sampled_pair(self) -> tuple[Array, Array]:
         if self.sampled is None:
             raise AttributeError("Phi and Gamma are those of a sample time: call linearize(…, dt=…).")
         return self.sampled
+
+    def reduced(self, motion: Any = None) -> "ReducedLinearization":
+        """The linear equations in the fewest numbers x (s,): those of deviations that constraints allow.
+
+        - `motion`: the `SteadyMotion` that this linearization is about. Deviations along cyclic coordinates are then
+          left out, and the others are seen from where it turns: A is constant along it, and its eigenvalues are the
+          exponents of its small motions. A zero is that of a steady motion next to it.
+
+        Constraints that depend on each other count once; inside `jit` all are taken as independent.
+        """
+        n, a, rows = len(self.names), self.A, self.allowed
+        if motion is not None:
+            layout = Layout.from_state(motion.q, motion.qdot)
+            a, rows = _remove_symmetries(a, rows, layout.flatten(motion.qdot), motion.turns)
+            cyclic = np.concatenate([np.ravel(x) for x in jax.tree.leaves(motion.cyclic)])
+            rows = rows[np.append(np.ones(len(self.allowed), bool), cyclic)]
+        rank = 2 * n - null_space(np.asarray(rows)).shape[1] if is_known(rows) else len(rows)
+        return ReducedLinearization._make(_reduce(rank, rows, a, self.B, self.C, self.D, self.sampled))
 
     def __str__(self) -> str:
         if not is_known(self.A) or np.ndim(self.A) != 2:
@@ -103,6 +132,41 @@ class Linearization(NamedTuple):
         if self.names.outputs != self.names.states:
             lines += _equations([f"δ{name}" for name in self.names.outputs], np.hstack([self.C, self.D]), of)
         return "\n".join(lines)
+
+
+class ReducedLinearization(NamedTuple):
+    """The linear equations of deviations (δq, δq̇) = `basis` x from a state, as LQR and Kalman filters take them.
+
+    - `A` (s, s), `B` (s, m), `C` (p, s), `D` (p, m): dx/dt = A x + B u, y = C x + D u.
+    - `basis` (2n, s), of orthonormal columns: x = basisᵀ (δq, δq̇) of a deviation that constraints allow.
+    - `Phi` (s, s) and `Gamma` (s, m) of a sample time; None without one.
+    """
+
+    A: Float[Array, "s s"]
+    B: Float[Array, "s m"]
+    C: Float[Array, "p s"]
+    D: Float[Array, "p m"]
+    basis: Float[Array, "2n s"]
+    Phi: Float[Array, "s s"] | None
+    Gamma: Float[Array, "s m"] | None
+
+
+@compile_for_one_call
+def _remove_symmetries(a: Array, rows: Array, qdot: Vector, turns: Array) -> tuple[Array, Array]:
+    """A in a frame that turns with a steady motion, and rows (k + n, 2n) whose last ones, one for each coordinate that
+    is cyclic, are zero for what is orthogonal to a deviation along it."""
+    spin = jnp.einsum("i,ijk", qdot, turns.astype(a.dtype))
+    moved = jnp.hstack([jnp.eye(len(qdot), dtype=a.dtype), turns.astype(a.dtype) @ qdot])
+    return a - jnp.kron(jnp.eye(2, dtype=a.dtype), spin), jnp.concatenate([rows, moved])
+
+
+@compile_for_one_call
+def _reduce(rank: int, rows: Array, a: Array, b: Array, c: Array, d: Array, sampled: tuple | None) -> tuple:
+    """The fields of a `ReducedLinearization` to what the `rows`, of this rank, send to zero."""
+    basis = tangent_basis(rows, rank)
+    inverse = factorize(basis.T @ basis).solve_columns(basis.T)  # orthonormal columns, but for derivatives
+    phi, gamma = (None, None) if sampled is None else (inverse @ sampled[0] @ basis, inverse @ sampled[1])
+    return inverse @ a @ basis, inverse @ b, c @ basis, d, basis, phi, gamma
 
 
 def _equations(left: list[str], rows: np.ndarray, of: list[str]) -> list[str]:

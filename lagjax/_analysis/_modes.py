@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Complex, Float
 from scipy.sparse import csr_array, diags_array
 
 from lagjax._analysis._closed_contacts import hold_closed
-from lagjax._analysis._eigen import exponents_and_modes, null_space, symmetric_modes
+from lagjax._analysis._eigen import exponents_and_modes, symmetric_modes, tangent_basis
 from lagjax._analysis._equilibrium import require_steady
 from lagjax._analysis._linearize import steady_matrices
 from lagjax._analysis._lowest_modes import NO_MODES, lowest_modes, lowest_shift, needs_all
@@ -26,7 +26,7 @@ from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._smoothness import is_smooth, require_smooth
 from lagjax._analysis._solve import shortest_solution
 from lagjax._analysis._sparse_balance import balance_of
-from lagjax._equations import SparseMotion, dependent_rows, diagonal_scale, factorize, least_norm, schur_complements
+from lagjax._equations import SparseMotion, dependent_rows, diagonal_scale, factorize, schur_complements
 from lagjax._equations import rank as rank_of
 from lagjax._interface import Layout, compile_for_one_call, is_concrete, show_str
 from lagjax._primitives import accepts_singles, nan_unless
@@ -193,7 +193,7 @@ def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> 
     residual = residual + jnp.where(_rank_is(jacobian, rank), 0, jnp.nan)
     gone, keep = np.array(cyclic, int), np.setdiff1d(np.arange(len(q)), cyclic)
     reduced, follow = _eliminate_cyclic(mass, rates, stiffness, keep, gone)
-    basis = _tangent_basis(jacobian[:, keep], rank)
+    basis = tangent_basis(jacobian[:, keep], rank)
     within = tuple(basis.T @ x @ basis for x in reduced)
     solve = _reversible_modes if reversible else _general_modes
     nothing = jnp.zeros((0, 2), jnp.result_type(q.dtype, jnp.complex64)), jnp.zeros((0, 0), q.dtype)
@@ -330,16 +330,6 @@ def _eliminate_cyclic(mass: Matrix, rates: Matrix, stiffness: Matrix, keep: np.n
         return jnp.where(at_rest[:, None], 0, shifted - drift)
 
     return reduced, follow
-
-
-def _tangent_basis(jacobian: Float[Array, "m n"], rank: int) -> Float[Array, "n n-rank"]:
-    """A basis of the deviations that constraints allow; it moves with the point as little as it can."""
-    if not len(jacobian):
-        return jnp.eye(jacobian.shape[1], dtype=jacobian.dtype)
-    basis = null_space(jacobian, rank)
-    # Zero in value, as `jacobian @ basis` is; its derivative keeps the basis on the tangent space.
-    correct = jax.vmap(lambda b: jacobian.T @ least_norm(jacobian @ jacobian.T, b), in_axes=1, out_axes=1)
-    return basis - correct(jacobian @ basis)
 
 
 def _reversible_modes(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Array, Array]:

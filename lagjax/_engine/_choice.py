@@ -7,7 +7,6 @@ fixed steps, an adjoint or a progress meter ask for diffrax; `solver=lagjax.Mach
 from typing import Any, NamedTuple
 
 from lagjax._engine._problem import AbstractEngine, Problem
-from lagjax._engine.diffrax import Diffrax
 from lagjax._engine.taylor import MachineCode
 
 
@@ -33,7 +32,9 @@ def requested_engine(
         if what := next((what for what, given in asked.items() if given), None):
             raise ValueError(_refusal(f"{what} asked for"))
         return solver
-    return Diffrax.from_arguments(solver, dt, adjoint, progress) if solver is not None or any(asked.values()) else None
+    if solver is None and not any(asked.values()):
+        return None
+    return _import_diffrax().from_arguments(solver, dt, adjoint, progress)
 
 
 _MACHINE_CODE = MachineCode()
@@ -41,18 +42,25 @@ _MACHINE_CODE = MachineCode()
 
 def choose(problem: Problem, requested: AbstractEngine | None = None, members: int = 1) -> Choice:
     """The engine for one or `members` problems. Raises `ValueError` where the `requested` one, or all, refuse them."""
-    if isinstance(requested, Diffrax):
-        engine, refusal = requested, "diffrax was asked for"
-    else:
+    if requested is None or isinstance(requested, MachineCode):
         refusal = _MACHINE_CODE.declines(problem) if requested is None else _MACHINE_CODE.lacks(problem)
         if refusal is None:
             return Choice(_MACHINE_CODE, None)
         if requested is not None:
             raise ValueError(_refusal(refusal))
-        engine = Diffrax()
+        engine = _import_diffrax()()
+    else:
+        engine, refusal = requested, "diffrax was asked for"
     if sentence := engine.refuses(problem) or engine.lacks_memory(problem, members):
         raise ValueError(f"{sentence}.")
     return Choice(engine, refusal)
+
+
+def _import_diffrax() -> Any:
+    """The engine `Diffrax`, imported where it is needed: diffrax takes half as long as JAX."""
+    from lagjax._engine.diffrax import Diffrax
+
+    return Diffrax
 
 
 def _refusal(reason: str) -> str:

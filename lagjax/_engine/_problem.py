@@ -16,12 +16,10 @@ from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jax.core import Tracer
 from jax.extend import core
 from jaxtyping import Array, Float, Int
@@ -60,6 +58,27 @@ DEFAULT_RTOL = 1e-9
 LEAST_RTOL = 0.25
 
 
+class Event(NamedTuple):
+    """Functions of the user's state that end a motion, in the user's structure, as `diffrax.Event` has them.
+
+    - `directions`, in the same structure: True for a root with a rising sign, False for a falling one, None for both.
+    - `root_finder`: that of diffrax which the user chose for the instant, or None.
+    """
+
+    conditions: PyTree
+    directions: PyTree
+    root_finder: Any = None
+
+    @property
+    def functions(self) -> list[Callable]:
+        return jax.tree.leaves(self.conditions, is_leaf=callable)
+
+    @property
+    def ways(self) -> list[bool | None]:
+        """The directions of the functions, in their order."""
+        return jax.tree.leaves(self.directions, is_leaf=lambda leaf: leaf is None)
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -83,7 +102,7 @@ class Problem:
     y0: Float[Numbers, " states"]
     tolerances: tuple[Float[Numbers, ""] | None, Float[Numbers, ""] | None]
     max_steps: int = field(metadata={"static": True})
-    event: diffrax.Event | None = None
+    event: "Event | None" = None
     guards: Hashable = field(metadata={"static": True}, default=None)
     is_rounded: bool = field(metadata={"static": True}, default=False)
 
@@ -173,13 +192,15 @@ def solve_in_doubles(solve: Callable, problem: Problem):
 
 
 class Batch(eqx.Module):
-    """Many problems of one scene, which differ in their initial states and in numbers of their parameters.
+    """Many problems of one scene, which differ in their initial states, in numbers of their parameters, and in times.
 
-    `member` is a problem of the structure of all; `y0` (N, 2n) holds the initial states, and `params` the parameters,
-    with the members as first axis of every leaf whose entry in `axes` is 0. Those whose entry is None are for all.
+    `member` is a problem of the structure of all. `ts` (N, T) are their output times, or (1, T) those of all; `y0`
+    (N, 2n) holds the initial states, and `params` the parameters, with the members as first axis of every leaf whose
+    entry in `axes` is 0. Those whose entry is None are for all.
     """
 
     member: Problem
+    ts: Float[Numbers, "times_of T"]
     y0: Float[Numbers, "N states"]
     params: PyTree
     axes: tuple[int | None, ...] = eqx.field(static=True)
@@ -190,11 +211,16 @@ class Batch(eqx.Module):
     ) -> "Batch":
         """The batch of `values` by name, q0, qdot0, params, with the axis of members of every leaf (`axes_per_leaf`).
 
+        `ts` are the output times (T,) of all, or (N, T) of each.
+
         Raises `TypeError` or `ValueError` as `Problem.from_arguments`; a number of one member alone may be NaN.
         """
         member = {name: jax.tree.map(_shape_of_one, value, axes[name]) for name, value in values.items()}
         layout = Layout.from_state(member["q0"], member["qdot0"])
-        one = Problem.from_system(system, layout, member["params"], ts, rtol, atol, max_steps, event)
+        times = output_times(ts, layout.dtype, rows=True)
+        each = times if times.ndim == 2 else times[None]
+        first = np.asarray(each)[0] if _is_on_host(each) else each[0]
+        one = Problem.from_system(system, layout, member["params"], first, rtol, atol, max_steps, event)
         arrays = {name: as_arrays(value, layout.dtype, name) for name, value in values.items()}
         for name, value in arrays.items():
             require_finite(jax.tree.map(lambda leaf, axis: leaf if axis is None else None, value, axes[name]), name)
@@ -206,7 +232,7 @@ class Batch(eqx.Module):
         of_state = (jax.tree.structure(values[name]).flatten_up_to(axes[name]) for name in ("q0", "qdot0"))
         y0 = rows(state, itertools.chain(*of_state), size, layout.dtype)
         spread = tuple(None if axis is None else 0 for axis in of_params)
-        return cls(one, y0, structure.unflatten(in_front), spread)
+        return cls(one, each, y0, structure.unflatten(in_front), spread)
 
     def __len__(self) -> int:
         return len(self.y0)
@@ -215,10 +241,11 @@ class Batch(eqx.Module):
         """`solve` under `jax.vmap` over the members; of `more`, that comes behind a problem, each has its own."""
         axes = jax.tree.unflatten(jax.tree.structure(self.params), self.axes)
 
-        def solve_member(y0, params, *more):
-            return solve(replace(self.member, y0=y0, params=params), *more)
+        def solve_member(ts, y0, params, *more):
+            return solve(replace(self.member, ts=ts, y0=y0, params=params), *more)
 
-        return jax.vmap(solve_member, in_axes=(0, axes, *[0] * len(more)))(self.y0, self.params, *more)
+        ts, of_ts = (self.member.ts, None) if self.shares_times else (self.ts, 0)
+        return jax.vmap(solve_member, in_axes=(of_ts, 0, axes, *[0] * len(more)))(ts, self.y0, self.params, *more)
 
     def map_in_turn(self, solve: Callable[[Problem], "Solution"]) -> "Solution":
         """`solve` of one member after the other."""
@@ -227,14 +254,24 @@ class Batch(eqx.Module):
         def solve_member(i):
             leaves = zip(jax.tree.leaves(self.params), self.axes, strict=True)
             params = structure.unflatten([x if axis is None else jnp.asarray(x)[i] for x, axis in leaves])
-            return solve(replace(self.member, y0=jnp.asarray(self.y0)[i], params=params))
+            ts = self.member.ts if self.shares_times else jnp.asarray(self.ts)[i]
+            return solve(replace(self.member, ts=ts, y0=jnp.asarray(self.y0)[i], params=params))
 
         return jax.lax.map(solve_member, jnp.arange(len(self)))
 
     @property
     def is_known(self) -> bool:
         numbers = eqx.filter(self.params, eqx.is_array_like)
-        return all(is_concrete(leaf) for leaf in jax.tree.leaves((self.member.ts, self.y0, numbers)))
+        return all(is_concrete(leaf) for leaf in jax.tree.leaves((self.ts, self.y0, numbers)))
+
+    @property
+    def shares_times(self) -> bool:
+        return len(self.ts) == 1
+
+    @property
+    def whole(self) -> Problem:
+        """The problem of one member with the times of all, as a trajectory of the batch has them."""
+        return self.member if self.shares_times else replace(self.member, ts=self.ts)
 
     @property
     def vectors(self) -> Float[Numbers, "members P"]:
@@ -266,12 +303,17 @@ class AbstractEngine(abc.ABC):
 
     default_rtol: ClassVar[Mapping[np.dtype, float]] = {DOUBLE: DEFAULT_RTOL, SINGLE: DEFAULT_RTOL}
 
+    @property
+    def is_implicit(self) -> bool:
+        """True if a step solves an equation."""
+        return False
+
     def rtol(self, problem: Problem) -> Float[Numbers, ""]:
         """rtol of a step: that of the problem, or by default that of this engine."""
         rtol, dtype = problem.tolerances[0], problem.layout.dtype
         return np.asarray(self.default_rtol[dtype], dtype) if rtol is None else as_arrays(rtol, dtype)
 
-    def tolerances(self, problem: Problem, y0: Float[Numbers, "*N states"]) -> tuple:
+    def tolerances(self, problem: Problem, y0: Float[Numbers, "*N states"]) -> tuple | None:
         """rtol, and atol where it was given; by default at most a sixteenth of rtol times the size of motions.
 
         Their size is, in these first states, the largest coordinate, or where they begin at zero how far the largest
@@ -284,7 +326,7 @@ class AbstractEngine(abc.ABC):
         # Within `jit` an operation on an array of JAX is traced, even where its numbers are known.
         ts, relative = library.asarray(ts), library.asarray(rtol)
         far, fast = (library.abs(half).max(axis=-1) for half in halves(library.asarray(y0)))
-        far = library.where(far > 0, far, fast * abs(ts[-1] - ts[0]))
+        far = library.where(far > 0, far, fast * abs(ts[..., -1] - ts[..., 0]))
         size = library.minimum(*(library.where(x > 0, x, library.inf) for x in (far, fast))).min(initial=library.inf)
         return rtol, relative * library.minimum(ATOL_OVER_RTOL, ATOL_OVER_MOTION * size)
 
@@ -353,11 +395,14 @@ def _zeros(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
     return np.broadcast_to(np.zeros((), dtype), shape)
 
 
-def axes_per_leaf(values: dict[str, PyTree], batch_axes) -> tuple[dict[str, PyTree], int]:
-    """`batch_axes` spread over every leaf, and the size of the batch, which must be the same everywhere."""
+def axes_per_leaf(values: dict[str, PyTree], batch_axes, ts=()) -> tuple[dict[str, PyTree], int]:
+    """`batch_axes` spread over every leaf, and the size of the batch, which must be the same everywhere.
+
+    Members may have times of their own, `ts` (N, T).
+    """
     if not isinstance(batch_axes, tuple) or len(batch_axes) != 3:
         raise ValueError(f"batch_axes must be a tuple of three, for (q0, qdot0, params); got {batch_axes!r}.")
-    axes, sizes = {}, {}
+    axes, sizes = {}, {"ts": np.shape(ts)[0]} if np.ndim(ts) == 2 else {}
     for (name, value), prefix in zip(values.items(), batch_axes, strict=True):
         labels, leaves, tree = labelled_leaves(value, name)
         try:
@@ -405,7 +450,7 @@ def _check_fields(dtype, params, ts, rtol, atol, max_steps, event) -> dict[str, 
     def array(x):
         return np.asarray(x, DOUBLE) if x is not None and is_concrete(x) else as_arrays(x, dtype)
 
-    tolerances, event = (array(rtol), array(atol)), _event(event, dtype)
+    tolerances, event = (array(rtol), array(atol)), _event(event)
     return dict(params=as_arrays(params, dtype), ts=ts, tolerances=tolerances, max_steps=max_steps, event=event)
 
 
@@ -421,29 +466,26 @@ def too_tight(rtol, dtype, least: float) -> str | None:
     )
 
 
-def _event(event, dtype) -> diffrax.Event | None:
-    """The event with its functions' signatures checked, and with a root finder that uses the dtype's digits."""
+def _event(event) -> Event | None:
+    """The event with its functions' signatures checked."""
     if isinstance(event, types.FunctionType):
-        return _known_event(Edition.from_function(event), dtype)
-    return None if event is None else _make_event(event, dtype)
+        return _known_event(Edition.from_function(event))
+    return None if event is None else _make_event(event)
 
 
 @functools.lru_cache(maxsize=64)  # a signature takes as long to read as a short motion
-def _known_event(event: Edition, dtype) -> diffrax.Event:
-    return _make_event(event.function, dtype)
+def _known_event(event: Edition) -> Event:
+    return _make_event(event.function)
 
 
-def _make_event(event, dtype) -> diffrax.Event:
-    condition = event.cond_fn if isinstance(event, diffrax.Event) else event
+def _make_event(event) -> Event:
+    condition = getattr(event, "cond_fn", event)  # of a `diffrax.Event`
     _, functions, _ = labelled_leaves(condition, "event", is_leaf=lambda leaf: leaf is None or callable(leaf))
     if not functions or not all(map(callable, functions)):
         raise TypeError(f"event must be a function event(q, qdot), or a pytree of such; got {condition!r}.")
-    if not isinstance(event, diffrax.Event):
-        event = diffrax.Event(event)
-    conditions = jax.tree.map(lambda function: accept(function, "event"), event.cond_fn, is_leaf=callable)
-    tolerance = 4 * float(jnp.finfo(dtype).eps)
-    root_finder = event.root_finder or _SignChange(rtol=tolerance, atol=tolerance)
-    return diffrax.Event(conditions, root_finder, event.direction)
+    directions = event.direction if condition is not event else jax.tree.map(lambda _: None, event, is_leaf=callable)
+    conditions = jax.tree.map(lambda function: accept(function, "event"), condition, is_leaf=callable)
+    return Event(conditions, directions, getattr(event, "root_finder", None))
 
 
 # The sign of the difference of two numbers where the one is less, or more, than the other.
@@ -494,7 +536,7 @@ def signs_of_event(problem: Problem) -> list[int | None]:
     """For each function of an event the sign of a comparison (`evaluate_condition`), 0 of a number, None of others."""
     assert problem.event is not None
     signs: list[int | None] = []
-    for function in jax.tree.leaves(problem.event.cond_fn, is_leaf=callable):
+    for function in problem.event.functions:
 
         def evaluate(y, t, numbers, function=function):
             value, sign = evaluate_condition(flat_condition(function, problem), y, t, numbers)
@@ -513,26 +555,3 @@ def flat_condition(function: Callable, problem: Problem) -> Callable:
         return function(*map(problem.layout.restore, halves(y)), t=t, params=eqx.combine(numbers, problem.params))
 
     return condition
-
-
-def has_own_root_finder(event: diffrax.Event) -> bool:
-    """True if the user has chosen how the instant of an event is found."""
-    return not isinstance(event.root_finder, _SignChange)
-
-
-class _SignChange(optx.Bisection):
-    """Bisection that stops when the interval is as small as the dtype resolves, whatever the size of the function.
-
-    The sign change that fired an event brackets its root, so that this always arrives. It also does where there is
-    nothing to find, as in members of a batch that had no event, or in a Boolean one: diffrax asks for the step's end.
-    """
-
-    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        lower, upper = (jnp.asarray(options[end], f_struct.dtype) for end in ("lower", "upper"))
-        state = optx.Bisection(self.rtol, self.atol, flip=True).init(fn, y, args, options, f_struct, aux_struct, tags)
-        return eqx.tree_at(lambda s: s.flip, state, fn(lower, args)[0] > fn(upper, args)[0])
-
-    def terminate(self, fn, y, args, options, state, tags):
-        scale = jnp.maximum(jnp.abs(state.lower), jnp.abs(state.upper))
-        small = jnp.abs(state.upper - state.lower) <= self.rtol * scale
-        return small & jnp.isfinite(state.error), optx.RESULTS.successful

@@ -15,12 +15,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from lagjax._equations import _form as forms
 from lagjax._equations import _saddle
 from lagjax._equations._constraints import velocity_scales
-from lagjax._equations._linear import eigen, is_definite, solve_many
+from lagjax._equations._linear import eigen, solve_many
 from lagjax._equations._recursion import RecursiveElimination
 from lagjax._native import Projection
 from lagjax._program import StraightLine, Unlowerable, is_smooth
@@ -82,6 +81,31 @@ def lowered_once(make: Callable) -> property:
     return property(get)
 
 
+class _Entries(NamedTuple):
+    """The numbers of a matrix that are not zero as it is derived, and their rows and columns."""
+
+    # An array of scipy.sparse, whose import takes a tenth of the first motion of a small scene, would be no shorter.
+    values: np.ndarray
+    places: tuple[np.ndarray, np.ndarray]
+    shape: tuple[int, int]
+
+    def toarray(self) -> np.ndarray:
+        matrix = np.zeros(self.shape)
+        matrix[self.places] = self.values
+        return matrix
+
+    def is_definite(self, least: float) -> bool:
+        """True if all eigenvalues of a symmetric matrix are larger than this."""
+        n = len(self.places[0]) if np.array_equal(*self.places) else -1
+        if n == self.shape[0]:
+            return bool(self.values.min(initial=np.inf) > least)
+        try:
+            np.linalg.cholesky(self.toarray() - least * np.eye(self.shape[0]))
+        except np.linalg.LinAlgError:
+            return False
+        return True
+
+
 class Accelerations:
     """The programs of a derivation that solve linear systems. Each is lowered on first use, or raises `Unlowerable`."""
 
@@ -90,7 +114,7 @@ class Accelerations:
         self._made: dict[str, Any] = {}
         self._lock = threading.RLock()
         self._responses: dict[tuple[int, ...], Program] = {}
-        self._sampled: dict[float, list[tuple[csr_array, csr_array]]] = {}
+        self._sampled: dict[float, list[tuple[_Entries, _Entries]]] = {}
 
     @lowered_once
     def program(self) -> Program:
@@ -313,7 +337,7 @@ class Accelerations:
     def _constant_mass(self) -> bool:
         return not self.of.reads("mass_matrix")
 
-    def samples(self, reach: float = 1.0, numbers: Any = None) -> list[tuple[csr_array, csr_array]]:
+    def samples(self, reach: float = 1.0, numbers: Any = None) -> "list[tuple[_Entries, _Entries]]":
         """M and G at a few states that nothing speaks for, where they are finite; `numbers` are those of params."""
         if numbers is not None:
             return self._evaluate_matrices([*self._columns(reach)[: 2 * self.layout.size + 1], *numbers])
@@ -326,12 +350,11 @@ class Accelerations:
         """The numbers of M and G that are not zero as they are derived."""
         return self.of.whole.select_outputs([k for name in _MATRICES for k in self.of.filled_positions(name)])
 
-    def _evaluate_matrices(self, columns: list) -> list[tuple[csr_array, csr_array]]:
+    def _evaluate_matrices(self, columns: list) -> "list[tuple[_Entries, _Entries]]":
         shapes, ends = [self.of.shape(name) for name in _MATRICES], [len(self.of.filled["mass_matrix"])]
         places = [np.divmod(self.of.filled[name], self.layout.size) for name in _MATRICES]
         samples = [np.split(x, ends) for x in self._entries.evaluate_many(columns).T if np.isfinite(x).all()]
-        make: Any = lambda *matrix: csr_array(matrix[:2], shape=matrix[2])  # noqa: E731
-        return [tuple(map(make, of, places, shapes)) for of in samples]
+        return [tuple(map(_Entries, of, places, shapes)) for of in samples]
 
     def _columns(self, reach: float = 1.0) -> list[np.ndarray]:
         """The inputs at these states, one array (states,) for each: of order one, but q of this order."""
@@ -352,15 +375,15 @@ class Accelerations:
         samples = self.samples(1.0, self._favorable) if self.of.counts_on_params else None
         return None if samples is None else self._judge(samples, self._rows(saddle))
 
-    def _judge(self, samples: list[tuple[csr_array, csr_array]], m: int) -> bool | None:
+    def _judge(self, samples: "list[tuple[_Entries, _Entries]]", m: int) -> bool | None:
         """True if M is regular at some states; None where it is not positive definite, on m rows of G at rest."""
         regular = True
         for matrix, jacobian in samples:
-            size = abs(matrix).max()
-            if is_definite(matrix, 1e-10 * size):
+            size = np.abs(matrix.values).max(initial=0.0)
+            if matrix.is_definite(1e-10 * size):
                 continue
-            regular, rows = False, jacobian[:m]
-            lowest = np.linalg.eigvalsh((matrix + rows.T @ rows).toarray())[0]
+            regular, rows = False, jacobian.toarray()[:m]
+            lowest = np.linalg.eigvalsh(matrix.toarray() + rows.T @ rows)[0]
             if (self.layout.size > 2 or m) and not lowest >= -1e-12 * size:
                 return None
         return regular

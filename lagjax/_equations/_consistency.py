@@ -5,6 +5,7 @@ own arguments, and answered with a sentence. Values that are being traced, as un
 """
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -144,11 +145,13 @@ def inconsistent_members(system, layout: Layout, ts, values: dict, axes: dict) -
     if not has_constraints(system) or not all(map(is_concrete, jax.tree.leaves((ts, values, system)))):
         return None
 
-    given = system, layout.dtype, jnp.asarray(ts[0]), jnp.abs(jnp.asarray(ts[-1]) - ts[0])
+    begin, span = jnp.asarray(ts[..., 0]), jnp.abs(jnp.asarray(ts[..., -1]) - ts[..., 0])
     numbers, of = zip(*((values[name], axes[name]) for name in ("q0", "qdot0", "params")), strict=True)
+    of_times = None if begin.ndim == 0 else 0
 
     def inconsistent(has_terms: bool):
-        return jax.vmap(lambda *one: _inconsistent(has_terms, *given, *one), in_axes=of)(*numbers)
+        test = functools.partial(_inconsistent, has_terms, system, layout.dtype)
+        return jax.vmap(test, in_axes=(of_times, of_times, *of))(begin, span, *numbers)
 
     found = inconsistent(False)
     return inconsistent(True) if found.any() else found  # what terms there are is compiled where it matters

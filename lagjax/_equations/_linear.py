@@ -24,7 +24,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from scipy.sparse import csr_array
 
 from lagjax._primitives import start_alike
 
@@ -103,18 +102,6 @@ def eigen(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return values, vectors
     order = np.argsort(diagonal)  # as of large scenes of bodies: LAPACK would take n³ operations
     return diagonal[order], np.eye(len(matrix), dtype=matrix.dtype)[:, order]
-
-
-def is_definite(matrix: csr_array, least: float) -> bool:
-    """True if all eigenvalues of a symmetric matrix are larger than this."""
-    n = len(matrix.indptr) - 1
-    if matrix.nnz == n and np.array_equal(matrix.indices, np.arange(n)):
-        return bool(matrix.data.min(initial=np.inf) > least)
-    try:
-        np.linalg.cholesky(matrix.toarray() - least * np.eye(n))
-    except np.linalg.LinAlgError:
-        return False
-    return True
 
 
 def null_directions(matrix: np.ndarray, threshold: float | None = None) -> np.ndarray:

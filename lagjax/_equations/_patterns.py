@@ -17,8 +17,8 @@ from typing import Any
 
 import jax
 import numpy as np
+import scipy
 from jax.extend import core
-from scipy.sparse import csr_array
 
 from lagjax._interface import compile_for_one_call
 from lagjax._program import lack_of_memory
@@ -46,7 +46,7 @@ _READS_ALL = "cumsum", "cumprod", "cummax", "cummin", "cumlogsumexp", "fft"
 _MOST_PRODUCTS = 1000
 
 
-def jacobian_pattern(function: Callable, shapes: tuple, by: int) -> csr_array | None:
+def jacobian_pattern(function: Callable, shapes: tuple, by: int) -> "scipy.sparse.csr_array | None":
     """The pattern (m, n) of ∂f/∂x, x being argument number `by` of f, f of shape (m,); None where that takes long."""
     # `shapes` are those of all arguments, pytrees of them; of arrays up to that one.
     import asdex
@@ -63,18 +63,18 @@ def jacobian_pattern(function: Callable, shapes: tuple, by: int) -> csr_array | 
     try:
         found = asdex.jacobian_sparsity(core.jaxpr_as_fun(_write_out(closed)), *leaves, argnums=by)
         entries = np.ones(len(found.rows), bool), (np.asarray(found.rows), np.asarray(found.cols))
-        pattern = csr_array(entries, shape=found.shape)
+        pattern = scipy.sparse.csr_array(entries, shape=found.shape)
         with jax.ensure_compile_time_eval():
             return pattern if _reads_all(pattern, flat, leaves, by) else None
     except Exception:  # of many kinds, as are the operations that it does not know
         return None
 
 
-def _reads_all(pattern: csr_array, function: Callable, leaves: list, by: int) -> bool:
+def _reads_all(pattern: "scipy.sparse.csr_array", function: Callable, leaves: list, by: int) -> bool:
     """True if products with ∂f/∂x as this pattern reads it off are derivatives of f, at two random states."""
     # Rows that are full are read off by products from the left.
     full = bool(np.diff(pattern.indptr).max(initial=0) > _MOST_TESTED)
-    pattern = csr_array(pattern.T) if full else pattern
+    pattern = scipy.sparse.csr_array(pattern.T) if full else pattern
     colors = color_columns(pattern)
     if (count := int(colors.max(initial=0)) + 1) > _MOST_TESTED:
         return True
@@ -188,7 +188,7 @@ def _largest_array(jaxpr) -> int:
     return max([0, *sizes, *map(_largest_array, core.subjaxprs(jaxpr))])
 
 
-def sparse_jacobian(function: Callable, shapes: tuple) -> Callable[..., csr_array] | None:
+def sparse_jacobian(function: Callable, shapes: tuple) -> "Callable[..., scipy.sparse.csr_array] | None":
     """∂f/∂x (m, n) as a function of the arguments x, … of f, by a product for each colour of its columns.
 
     None where its pattern is not known or has many colours.
@@ -210,14 +210,14 @@ def sparse_jacobian(function: Callable, shapes: tuple) -> Callable[..., csr_arra
         products = jax.lax.map(lambda k: multiply((colors == k).astype(x.dtype)), np.arange(count), batch_size=16)
         return products[colors[columns], rows], multiply(factors.astype(x.dtype))
 
-    def jacobian(x, *others) -> csr_array:
+    def jacobian(x, *others) -> "scipy.sparse.csr_array":
         values, exact = map(np.asarray, read(x, *others))
         if differing_rows(values, rows, factors[columns], exact, x.dtype, least=0.01).any():
             raise ValueError(
                 "The derivatives of the forces or constraints at this state hold entries that were not found among "
                 'the operations of the scene: give System(..., path="scalar"), which derives them one by one.'
             )
-        return csr_array((values, (rows, columns)), shape=shape)
+        return scipy.sparse.csr_array((values, (rows, columns)), shape=shape)
 
     return jacobian
 
@@ -247,7 +247,7 @@ def _visited(jaxpr) -> int:
     return count
 
 
-def color_columns(pattern: csr_array) -> np.ndarray:
+def color_columns(pattern: "scipy.sparse.csr_array") -> np.ndarray:
     """A colour for each column of a pattern: columns of one colour share no row (Curtis, Powell & Reid 1974)."""
     # The first that is free in all rows of the column; those taken in a row are the bits of a whole number.
     columns, taken, colors = pattern.tocsc(), [0] * (len(pattern.indptr) - 1), []

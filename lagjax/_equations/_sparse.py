@@ -20,9 +20,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Bool, Float, Int
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
 
 from lagjax._equations._linear import factorize, least_norm, rank, rank_tolerance, singular_threshold
 from lagjax._equations._patterns import color_columns
@@ -70,7 +69,7 @@ class MatrixForm(abc.ABC):
 class Entries(MatrixForm):
     """A form that reads off the entries at `rows`, `columns` by products with the indicators of `colors`."""
 
-    def __init__(self, pattern: csr_array, colors: np.ndarray):
+    def __init__(self, pattern: "scipy.sparse.csr_array", colors: np.ndarray):
         entries = pattern.tocoo()
         self.size, self.rows, self.columns, self.colors = len(colors), entries.row, entries.col, colors
         self.count = int(colors.max()) + 1
@@ -96,7 +95,7 @@ class Diagonal(Entries):
 
     name = "diagonal"
 
-    def __init__(self, pattern: csr_array):
+    def __init__(self, pattern: "scipy.sparse.csr_array"):
         super().__init__(pattern, np.zeros(pattern.nnz, int))
 
     def prepare(self, multiply, dtype, dependent=False):
@@ -109,7 +108,7 @@ class Diagonal(Entries):
 class Blocks(Entries):
     """Connected components: `groups` of those of one size, each an array (count, size) of rows."""
 
-    def __init__(self, pattern: csr_array, label: np.ndarray):
+    def __init__(self, pattern: "scipy.sparse.csr_array", label: np.ndarray):
         order, sizes = np.argsort(label, kind="stable"), np.bincount(label)
         ends = np.cumsum(sizes)
         place = np.empty(len(label), int)
@@ -154,7 +153,7 @@ class Blocks(Entries):
 class Band(Entries):
     """A band of `width` entries on either side of the diagonal, in the `order` of reverse Cuthill–McKee."""
 
-    def __init__(self, pattern: csr_array, order: np.ndarray, width: int):
+    def __init__(self, pattern: "scipy.sparse.csr_array", order: np.ndarray, width: int):
         place = np.argsort(order)
         super().__init__(pattern, place % (2 * width + 1))
         self.order, self.width, self.name = order, width, f"a band of {width}"
@@ -211,7 +210,7 @@ class Sparse(Entries):
 
     iterative = True
 
-    def __init__(self, pattern: csr_array, colors: np.ndarray):
+    def __init__(self, pattern: "scipy.sparse.csr_array", colors: np.ndarray):
         super().__init__(pattern, colors)
         self.name = f"sparse ({len(self.rows)} entries)"
         length = np.diff(pattern.indptr)
@@ -272,19 +271,19 @@ def refine(product: Callable, solve: Callable, right):
     return jax.lax.fori_loop(0, 2, once_more, (jax.tree.map(jnp.zeros_like, right), right))[0]
 
 
-def form_of(pattern: csr_array | None, size: int) -> MatrixForm:
+def form_of(pattern: "scipy.sparse.csr_array | None", size: int) -> MatrixForm:
     """The form that suits the pattern of a symmetric matrix; None is an unknown one."""
     if pattern is None:
         return MatrixFree(size)
-    diagonal = csr_array((np.ones(size, bool), (np.arange(size), np.arange(size))), shape=(size, size))
-    pattern = csr_array(pattern + pattern.T + diagonal)
+    diagonal = scipy.sparse.csr_array((np.ones(size, bool), (np.arange(size), np.arange(size))), shape=(size, size))
+    pattern = scipy.sparse.csr_array(pattern + pattern.T + diagonal)
     pattern.sort_indices()
     if pattern.nnz == size:
         return Diagonal(pattern)
-    _, label = connected_components(pattern, directed=False)
+    _, label = scipy.sparse.csgraph.connected_components(pattern, directed=False)
     if np.bincount(label).max() <= LARGEST_BLOCK:
         return Blocks(pattern, label)
-    order = reverse_cuthill_mckee(pattern, symmetric_mode=True)
+    order = scipy.sparse.csgraph.reverse_cuthill_mckee(pattern, symmetric_mode=True)
     place, entries = np.argsort(order), pattern.tocoo()
     width = int(np.abs(place[entries.row] - place[entries.col]).max())
     if width <= WIDEST_BAND:

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.sparse import csr_array, vstack
+import scipy
 
 from lagjax._equations._motion import Flag, Motion, PyTree, Row, Time, Vector
 from lagjax._equations._patterns import jacobian_pattern
@@ -52,24 +52,24 @@ def structure_of(motion: Motion, shapes: tuple, mass: MatrixForm) -> SparseStruc
         return None
     inverse = _pattern_of_inverse(mass)
 
-    def schur(jacobian: csr_array) -> MatrixForm:
-        pattern = None if inverse is None else csr_array((jacobian @ inverse @ jacobian.T) != 0)
+    def schur(jacobian: "scipy.sparse.csr_array") -> MatrixForm:
+        pattern = None if inverse is None else scipy.sparse.csr_array((jacobian @ inverse @ jacobian.T) != 0)
         return form_of(pattern, len(jacobian.indptr) - 1)
 
-    both = csr_array(vstack([pattern.astype(np.int32) for pattern in (rows, on_velocities)]))
+    both = scipy.sparse.csr_array(scipy.sparse.vstack([pattern.astype(np.int32) for pattern in (rows, on_velocities)]))
     return SparseStructure(mass, schur(both), schur(rows) if count else None)
 
 
-def _pattern_of_inverse(form: MatrixForm) -> csr_array | None:
+def _pattern_of_inverse(form: MatrixForm) -> "scipy.sparse.csr_array | None":
     """The pattern of M⁻¹ where it is sparse: diagonal, or full blocks."""
     n = form.size
     if isinstance(form, Diagonal):
-        return csr_array((np.ones(n, np.int32), (np.arange(n), np.arange(n))), shape=(n, n))
+        return scipy.sparse.csr_array((np.ones(n, np.int32), (np.arange(n), np.arange(n))), shape=(n, n))
     if not isinstance(form, Blocks):
         return None
     rows = np.concatenate([np.repeat(members, members.shape[1], axis=1).ravel() for members in form.groups])
     columns = np.concatenate([np.tile(members, (1, members.shape[1])).ravel() for members in form.groups])
-    return csr_array((np.ones(len(rows), np.int32), (rows, columns)), shape=(n, n))
+    return scipy.sparse.csr_array((np.ones(len(rows), np.int32), (rows, columns)), shape=(n, n))
 
 
 class SparseMotion(Motion):

@@ -12,6 +12,7 @@ Three rooms, each of which imports only from those before it:
     result/    Fit: intervals, what is not seen, verdict, profile, draws, predictions, report
 """
 
+import contextlib
 import functools
 import itertools
 import sys
@@ -88,7 +89,9 @@ def fit(
       for those that show angles less whole turns.
     - `free`: True or False for every parameter, or for whole branches of `params0`, or a Boolean array for the numbers
       of an array; by default all floats are free. With False starts and noise alone are fitted: how good are published
-      parameters on these records?
+      parameters on these records? `lagjax.per_record` for a number, or a whole array, that every record has of its own:
+      an offset, a gain, a delay, or what a start is computed from. Functions of the scene and `observe` see the number
+      of the record that they are called for; `Fit.params` has them all, with the records as first axis.
     - `transforms`: `lagjax.positive`, `lagjax.between(a, b)`, `lagjax.angle` or None for every parameter or branch;
       an array of these for the numbers of an array, `np.array([lagjax.positive, None])`; `lagjax.simplex` and
       `lagjax.inertia` for a whole array. A parameter that is known to be positive should say so:
@@ -189,16 +192,22 @@ class _FitSearch(NamedTuple):
         residuals = assemble_residuals(given, parameters, self.law)
         self._require_one_beginning(residuals)
         readers = read_records(residuals)
-        if self.progress:
-            residuals.watch = _print_trials(residuals.size)
         u = parameters.inverse(parameters.first)
         point, waterfall = Point(u, first_starts(residuals, readers, self.params0)), None
+        residuals, point = _keep_unused(residuals, point)
+        if self.progress:
+            residuals.watch = _print_trials(residuals.size)
         search = Search(residuals, self.law, self.method, readers)
         if self.method == "gradient":
             descent = search.descend_gradient(point)
         else:
             descent, waterfall = run_multistart(residuals, search, point, self.starts, self.seed)
-            may = looks_further and self.starts == 1 and len(parameters) and not any(p.clocks for p in residuals.parts)
+            may = (
+                looks_further
+                and self.starts == 1
+                and len(residuals.parameters)
+                and not any(p.clocks for p in residuals.parts)
+            )
             for starts in _MORE_STARTS if may and any(jumps(part.scene) for part in residuals.parts) else ():
                 if not is_doubtful(descent):
                     break
@@ -250,6 +259,22 @@ class _FitSearch(NamedTuple):
         slower = scales.data / scales.scene if np.isfinite(scales.data) else 1.0
         possible = possible_mistakes(system.records, part.signals.names, left.worst, slower)
         return find_mistake(share, possible, left.share, max(spent, SECONDS) if left.motion else spent)
+
+
+def _keep_unused(residuals: Residuals, point: Point) -> tuple[Residuals, Point]:
+    """The residuals and the point where numbers of records on which the signals of their system do not depend at all,
+    but those of others do, stay as they are: the offset of a sensor that one of two machines has."""
+    states, unknowns, kept = residuals.states, residuals.unknowns, np.zeros(len(residuals.parameters), bool)
+    if unknowns.own and len(residuals.parts) > 1:
+        with contextlib.suppress(LostMotion):
+            own = (x[..., states : states + unknowns.own].any(axis=(0, 1, 2)) for x in residuals.evaluate(point).slopes)
+            uses = np.array([np.any([next(own) for _ in part.batches], axis=0) for part in residuals.parts])
+            for part, used in zip(residuals.parts, uses, strict=True):
+                kept[unknowns.columns[part.frame.rows, : unknowns.own][:, ~used & uses.any(axis=0)]] = True
+    if not kept.any():
+        return residuals, point
+    parameters = residuals.parameters.fix(point.u, kept)
+    return residuals.with_parameters(parameters), point._replace(u=point.u[~kept])
 
 
 def _print_trials(size: np.ndarray) -> Callable[[Any], None]:

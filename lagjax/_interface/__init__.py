@@ -15,7 +15,15 @@ from lagjax._interface._arguments import (
     present,
     restrict_signature,
 )
-from lagjax._interface._layout import Layout, describe_numbers, dtype_of, flatten_numbers, halves, labelled_leaves
+from lagjax._interface._layout import (
+    Layout,
+    describe_numbers,
+    dtype_of,
+    flatten_numbers,
+    halves,
+    labelled_leaves,
+    number_names,
+)
 from lagjax._interface._platform import (
     compile_for_one_call,
     compiled_once,

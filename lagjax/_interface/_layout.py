@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -136,6 +137,13 @@ def describe_numbers(tree: PyTree, name: str) -> str:
         for place, value in np.ndenumerate(np.asarray(leaf))
     ]
     return join_names(found)
+
+
+def number_names(tree: PyTree, name: str) -> list[str]:
+    """A name for each number in a pytree, such as params['m'][0], in the order of its leaves."""
+    labels, leaves, _ = labelled_leaves(tree, name)
+    shapes = [(label, np.shape(leaf)) for label, leaf in zip(labels, leaves, strict=True) if eqx.is_array_like(leaf)]
+    return [label + str(list(at)) * bool(shape) for label, shape in shapes for at in np.ndindex(shape)]
 
 
 def labelled_leaves(tree: PyTree, name: str, is_leaf=None) -> tuple[tuple[str, ...], list, Any]:

@@ -1,4 +1,4 @@
-"""Functions of rooms above that a trajectory calls: it shows itself, its failure is explained.
+"""Functions of rooms above that a trajectory or a scene calls: it shows itself, its failure is explained.
 
 No room imports from above. `lagjax/__init__` stands above all of them and registers these functions; each imports its
 room when it is called.
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 
 class Registered(NamedTuple):
-    """The functions, each of a trajectory or of a table in it; `units` and `time_unit` are those of `to_xarray`."""
+    """The functions, of a scene, a trajectory or a table in it; `units` and `time_unit` are those of `to_xarray`."""
 
     summary: Callable[[Any], str]
     trajectory_html: Callable[[Any], str | None]
@@ -17,9 +17,12 @@ class Registered(NamedTuple):
     frame: Callable[[Any, Any, str | None], Any]
     impact_frame: Callable[[Any], Any]
     change_frame: Callable[[Any], Any]
+    write_equations: Callable[..., Any]
+    write_c: Callable[..., str]
     make_animation: Callable[[Any, Callable, Any, float, float], Any]
     examine: Callable[[Any, Any], Any]
     contact_forces: Callable[[Any, str], Any]
+    find_states: Callable[[Any, Any], Any]
     describe_failure: Callable[[Any, Any, str | None], str]
 
 

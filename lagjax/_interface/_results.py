@@ -1,12 +1,12 @@
 """The outcomes of a trajectory in words: result codes, what to try, the exception that carries one, and lists of names.
 
-The codes are diffrax's own and ours. They travel inside `jit` and `vmap` as arrays, one per member of a batch;
-only `simulate` turns one into an exception.
+The codes are those of diffrax, by the same names and numbers, and ours. They travel inside `jit` and `vmap` as arrays,
+one per member of a batch; only `simulate` turns one into an exception.
 """
 
 from collections.abc import Sequence
 
-import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,7 +23,7 @@ PUSHED = (
 )
 
 
-class _InWords(type(diffrax.RESULTS)):
+class _InWords(type(eqx.Enumeration)):
     def __getitem__(cls, item) -> str:
         """The sentence of one result, or its name where it has none; of many, how many there are by name."""
         code = item._value
@@ -36,11 +36,29 @@ class _InWords(type(diffrax.RESULTS)):
         )
 
 
-class RESULTS(diffrax.RESULTS, metaclass=_InWords):  # pyright: ignore[reportGeneralTypeIssues]
+class RESULTS(eqx.Enumeration, metaclass=_InWords):  # pyright: ignore[reportGeneralTypeIssues]
     """The result codes of diffrax, extended; compare with `trajectory.result == lagjax.RESULTS.successful`."""
 
     __module__ = "lagjax"  # as it is printed
 
+    # Those of diffrax, in their order; a subclass of `diffrax.RESULTS` would import diffrax for every motion, which
+    # takes half as long as JAX. Those that only its solvers return are told in `_engine/diffrax/_integrate`.
+    successful = ""
+    max_steps_reached = "The budget of steps was spent."
+    singular = "A linear equation of an implicit step is singular."
+    breakdown = "An iterative solution of a linear equation of an implicit step broke down."
+    stagnation = "An iterative solution of a linear equation of an implicit step stagnated."
+    conlim = "A linear equation of an implicit step is nearly singular."
+    nonfinite_input = "A linear equation of an implicit step holds NaN or an infinite number."
+    nonlinear_max_steps_reached = "The equation of an implicit step was not solved in its budget of iterations."
+    nonlinear_divergence = "The iteration for the equation of an implicit step diverged."
+    nonfinite = "The iteration for the equation of an implicit step met NaN or an infinite number."
+    dt_min_reached = "The step size shrank to nothing."
+    event_occurred = "An event ended the motion."
+    max_steps_rejected = "The budget of rejected steps that a controller of diffrax remembers was spent."
+    internal_error = (
+        "A solver of diffrax failed in a way that its author holds to be impossible: please report it there."
+    )
     nonfinite_state = (
         "The state or its acceleration is NaN or infinite there, or just ahead. Look at the gaps of contacts, the "
         "Lagrangian, its gradient, the forces and the parameters at that time and state: a root or norm at zero, a "
@@ -126,7 +144,7 @@ class RESULTS(diffrax.RESULTS, metaclass=_InWords):  # pyright: ignore[reportGen
     )
 
 
-def code_of(result: diffrax.RESULTS) -> int:
+def code_of(result: RESULTS) -> int:
     return int(result._value)
 
 

@@ -166,11 +166,15 @@ def _say_params(value) -> str:
     return " Parameters come behind it; or name them, params=…."
 
 
-def output_times(ts, dtype) -> jax.Array | np.ndarray:
-    """The output times as an array (T,) of this dtype. Raises for what is not strictly monotonic, or not two times."""
-    if isinstance(ts, np.ndarray | jax.Array) and _is_plain(ts, dtype) and is_concrete(ts) and ts.ndim == 1:
+def output_times(ts, dtype, rows: bool = False) -> jax.Array | np.ndarray:
+    """The output times as an array (T,) of this dtype; with `rows` also (N, T), a row for each of N members.
+
+    Raises for what is not strictly monotonic, or not two times.
+    """
+    known = isinstance(ts, np.ndarray | jax.Array) and _is_plain(ts, dtype) and is_concrete(ts)
+    if known and (ts.ndim == 1 or (rows and ts.ndim == 2)):
         values = np.asarray(ts)  # most often there is nothing to say
-        if len(values) > 1 and _is_monotonic(values) and all_finite(values):
+        if values.shape[-1] > 1 and len(values) and _is_monotonic(values) and all_finite(values):
             return ts
     if getattr(getattr(ts, "dtype", None), "kind", None) in ("m", "M"):
         raise TypeError(
@@ -182,12 +186,12 @@ def output_times(ts, dtype) -> jax.Array | np.ndarray:
     except (TypeError, ValueError):
         got = f"{type(ts).__name__}.{_say_params(ts)}"
         raise TypeError(f"ts must be an array of output times; got {got}") from None
-    if np.ndim(ts) == 2:
+    if np.ndim(ts) == 2 and not rows:
         raise ValueError(
-            f"ts must be one row of output times, which all members share; got shape {np.shape(ts)}. For times of "
-            "their own: jax.vmap(lambda q0, qdot0, ts: lagjax.simulate(system, q0, qdot0, ts))(q0, qdot0, ts)."
+            f"ts must be one row of output times; got shape {np.shape(ts)}. lagjax.simulate_batch(system, q0, qdot0, "
+            "ts) takes a row of times for each of its members."
         )
-    if np.ndim(ts) != 1 or np.size(ts) < 2:
+    if np.ndim(ts) not in (1, 2) or np.shape(ts)[-1] < 2 or not np.size(ts):
         raise ValueError(f"ts must hold at least two output times, ts[0] the start; got shape {np.shape(ts)}.")
     if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
         raise TypeError(f"ts must hold real numbers; got {kind}.")
@@ -198,7 +202,8 @@ def output_times(ts, dtype) -> jax.Array | np.ndarray:
         values = np.asarray(times)
         if not _is_monotonic(values):
             gaps = np.sign(np.diff(values))
-            place = int(np.argmax(gaps != gaps[0])) if gaps[0] else 0
+            wrong = (gaps != gaps[..., :1]) | (gaps == 0)
+            place = ", ".join(map(str, np.argwhere(wrong)[0]))
             raise ValueError(
                 f"ts must be strictly increasing or strictly decreasing, in {np.dtype(dtype).name}; it is not between "
                 f"ts[{place}] and the next."
@@ -207,8 +212,8 @@ def output_times(ts, dtype) -> jax.Array | np.ndarray:
 
 
 def _is_monotonic(values: np.ndarray) -> bool:
-    later, earlier = values[1:], values[:-1]
-    return bool((later > earlier).all() or (later < earlier).all())
+    later, earlier = values[..., 1:], values[..., :-1]
+    return bool(((later > earlier).all(-1) | (later < earlier).all(-1)).all())
 
 
 def require_tolerance(value, name: str):

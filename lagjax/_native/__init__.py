@@ -35,9 +35,10 @@ from lagjax._native.code._constants import (
 from lagjax._native.code._ir import lanes
 from lagjax._native.code._loops import Floats, Loop, Struct, Wholes, compile_loops, evaluate, integrate, loop
 from lagjax._native.motions import _gpu as gpu
+from lagjax._native.motions._c_lines import CNumbers, write_function
 from lagjax._native.motions._derivative_handler import derivative_handler
 from lagjax._native.motions._handler import Plan, handler, make_once, unavailable
-from lagjax._native.motions._kernel import Begun, Kernel, StepRecord, cores, floor_of
+from lagjax._native.motions._kernel import Begun, Kernel, Steps, cores, floor_of
 from lagjax._native.motions._line_handler import LineCode, compilation_work, line_handler
 from lagjax._native.series._guards import Guards, append_guards
 from lagjax._native.series._motion_parts import Projection, pieces_of, recurrences

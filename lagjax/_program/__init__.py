@@ -8,8 +8,8 @@ that have one of their own. Pieces: `_deciding` (what decides), `_decisions` (by
 `_levels` (their borders), `_beginnings` (where a motion begins), `_borders` (all of that), `_sliding` (along them, by
 `_border_forces`, `_held` and `_small_equations`), `_jump` and `_kick` (over them, by `_jump_search`), `_features` and
 `_powers` (where no series helps), `_look_ups` (tables). A program consists of a `_line`, with its values in
-NumPy; `_rounding` is for their error. `_memory` bounds what a graph may take. What JAX traces becomes a graph in
-`_tracing`.
+NumPy; `_rounding` is for their error, `_formulas` for readers. `_memory` bounds what a graph may take. What JAX traces
+becomes a graph in `_tracing`.
 """
 
 from lagjax._program._borders import (
@@ -33,6 +33,7 @@ from lagjax._program._differentiation import (
     with_tangents,
 )
 from lagjax._program._features import BELOW, FALLS, GROWS, UP_TO, Feature
+from lagjax._program._formulas import Formulas, Product, Sum
 from lagjax._program._graph import INPUTS, NUMBERS, PAIRS, Graph, Tape, Unlowerable, find_ancestors
 from lagjax._program._jump import Jump, Nesting, jump_at_border, row_places, with_borders_of_tangents
 from lagjax._program._levels import CLOCK, CONE, FLOOR, SIGN, SLIDE, TABLE, TRUNC, Affine, Level

@@ -14,7 +14,7 @@ from lagjax._program._small_equations import Sparse, dot
 
 _BENT, _STATES = 1e-9, 32  # of a chord, of which rounding is a thousandth; and random states, for pieces of all kinds
 LARGEST_SLIDING = 10_000_000  # operations: a bound for errors
-# The length of the vector of a cone that is as good as none: forces change by so little beside it, and its square is
+# The length of the vector of a cone that is as good as none: forces hardly change near it, and its square is
 # there. What friction does along each of its parts is read off there.
 _TINY = 2.0**-300
 

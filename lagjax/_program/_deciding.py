@@ -1,4 +1,4 @@
-"""The operations of a program, as it is written, that decide: those that become pieces, or that steps end beside."""
+"""The operations of a program, as it is written, that decide: those that become pieces, or near which steps end."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

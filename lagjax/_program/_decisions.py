@@ -8,7 +8,7 @@
     u / |u| of velocities               whether the vector u moves, 1, or rests, −1: dry friction in the plane
 
 A *piece* is what was decided: one of these numbers, constant along a step. Here a program becomes one that takes its
-pieces as further inputs, so that along every step it is smooth; beside it stand the switching numbers.
+pieces as further inputs, so that along every step it is smooth; the switching numbers are outputs as well.
 
 Not followed are `eq` and `ne`, whose border is a point, and what does not change along the motion. Where a root or a
 power that is not whole begins right at a border, as in max(q, 0)**1.5, there is no series to begin with beyond it: such

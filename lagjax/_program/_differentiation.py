@@ -335,8 +335,8 @@ def pullback_and_entries(
         for k, output in enumerate(of):
             if line.nodes[line.outputs[output]][0] != "constant":  # rows of contacts are zeros but for a few numbers
                 placed._add(cotangents, line.outputs[output], placed.graph.input(len(dtypes) + k, "float"))
-        results = placed.cotangents(cotangents, by, tables, varies, is_linear)
-        results += [i for _, *entry in tables for i in entry]
+        pulled, zero = placed.pull(cotangents, frozenset(by), tables, varies, is_linear), placed.graph.number(0.0)
+        results = [*(pulled.get(i, zero) for i in by), *(i for _, *entry in tables for i in entry)]
         done = placed.finish_line(results, known, len(dtypes) + len(of))
     return done, tuple(table for table, *_ in tables)
 
@@ -447,18 +447,6 @@ class _PlacedLine(Derivatives):
             if k in parts and graph.value(parts[k]) != 0:
                 tangents[k] = parts[k]
         return tangents
-
-    def cotangents(
-        self,
-        cotangents: dict[int, int],
-        by: Sequence[int],
-        tables: list | None = None,
-        varies: Callable[[Table], bool] = lambda table: False,
-        is_linear: bool = False,
-    ) -> list[int]:
-        """The cotangents of the inputs `by`, in their order, as `pull` gives them; 0 where there is none."""
-        results = self.pull(cotangents, frozenset(by), tables, varies, is_linear)
-        return [results[i] if i in results else self._number(0.0) for i in by]
 
     def pull(
         self,

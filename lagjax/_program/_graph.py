@@ -22,7 +22,7 @@ import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -89,6 +89,16 @@ def find_descendants(readers: Sequence[Sequence[int]], starts: Iterable[int]) ->
     return sorted(found)
 
 
+class _Collected(NamedTuple):
+    """The products and sums of a graph, known by what they consist of."""
+
+    factors: dict[int, tuple[int, ...]]  # of each product
+    terms: dict[int, dict[int, float]]  # of each sum, with their coefficients
+    products: dict[tuple[int, ...], int]
+    sums: dict[frozenset, tuple[int, float]]  # and whether it is that sum or its negative
+    with_squares: set[int]  # the products that hold a sine twice
+
+
 class Graph:
     """Scalars under construction. `apply` is the one door: it folds, simplifies and shares before it adds a node.
 
@@ -103,14 +113,9 @@ class Graph:
         self.budget = budget
         self._operations = 0
         self._ids: dict = {}
-        self._factors: dict[int, tuple[int, ...]] = {}
-        self._terms: dict[int, dict[int, float]] = {}
-        self._products: dict[tuple[int, ...], int] = {}
-        self._sums: dict[frozenset, tuple[int, float]] = {}  # and whether it is that sum or its negative
-        self._with_squares: set[int] = set()  # the products that hold a sine twice
+        self._collected = _Collected({}, {}, {}, {}, set())
         self.powers: dict[int, tuple[int, float]] = {}  # what is a power of another node, and which
-        self._arrays: list[bytes] = []  # long arrays of numbers, and where their ids begin and end
-        self._ends = [NUMBERS]
+        self._arrays: dict[bytes, int] = {}  # long arrays of numbers, and where their ids begin
         self.floats: dict[int, int] = {}  # integers that are indices, as floats
         self._growing: list[bool] = []
         self._hides_growth = False
@@ -249,16 +254,12 @@ class Graph:
     def array(self, numbers: np.ndarray) -> np.ndarray:
         """Ids of the numbers of a long array, in its shape."""
         data = np.ascontiguousarray(numbers, np.float64).tobytes()
-        if data not in self._arrays:
-            self._arrays.append(data)
-            self._ends.append(self._ends[-1] + numbers.size)
-        first = self._ends[self._arrays.index(data)]
+        first = self._arrays.setdefault(data, NUMBERS + sum(map(len, self._arrays)) // 8)
         return np.arange(first, first + numbers.size).reshape(numbers.shape)
 
     def array_of(self, i: int) -> tuple[bytes, int]:
         """The long array that an id is a number of, and where its ids begin."""
-        k = int(np.searchsorted(self._ends, i, side="right")) - 1
-        return self._arrays[k], self._ends[k]
+        return next(array for array in reversed(self._arrays.items()) if array[1] <= i)
 
     def constant(self, value, kind: str) -> int:
         value = float(value) if kind == "float" else np.dtype(kind).type(value).item()
@@ -336,14 +337,14 @@ class Graph:
 
     def product(self, a: int, b: int) -> int:
         """`a * b`, or an earlier product of the same factors."""
-        factors = tuple(sorted(self._factors.get(a, (a,)) + self._factors.get(b, (b,))))
+        factors = tuple(sorted(self._collected.factors.get(a, (a,)) + self._collected.factors.get(b, (b,))))
         if len(factors) > LONGEST_SUM:
             return self.node("mul", a, b)
-        if (product := self._products.get(factors)) is None:
-            product = self._products[factors] = self.node("mul", a, b)
-            self._factors[product] = factors
+        if (product := self._collected.products.get(factors)) is None:
+            product = self._collected.products[factors] = self.node("mul", a, b)
+            self._collected.factors[product] = factors
             if any(i == j and self.nodes[i][0] == "sin" for i, j in itertools.pairwise(factors)):
-                self._with_squares.add(product)
+                self._collected.with_squares.add(product)
         return product
 
     def terms(self, i: int) -> dict[int, float]:
@@ -351,8 +352,8 @@ class Graph:
         if (value := self.value(i)) is not None:
             return {self.constant(1, "float"): value}
         coefficient, base = self.term(i)
-        if abs(coefficient) == 1 and base in self._terms:
-            return {x: coefficient * c for x, c in self._terms[base].items()}
+        if abs(coefficient) == 1 and base in self._collected.terms:
+            return {x: coefficient * c for x, c in self._collected.terms[base].items()}
         return {base: coefficient}
 
     def sum(self, a: int, b: int, sign: int) -> int:
@@ -364,7 +365,7 @@ class Graph:
         terms = dict(left)
         for base, coefficient in right.items():
             terms[base] = terms.get(base, 0.0) + sign * coefficient
-        if not self._with_squares.isdisjoint(terms):
+        if not self._collected.with_squares.isdisjoint(terms):
             self._pythagoras(terms)
         if 0.0 in terms.values():
             terms = {base: coefficient for base, coefficient in terms.items() if coefficient != 0}
@@ -399,11 +400,11 @@ class Graph:
         """`a + sign*b`, which is the sum of `terms`: an earlier node, or its negative, if there is one."""
         first = -1.0 if terms[min(terms)] < 0 else 1.0  # a sum and its negative are known by one key
         key = frozenset(terms.items() if first > 0 else [(x, -c) for x, c in terms.items()])
-        if (known := self._sums.get(key)) is not None:
+        if (known := self._collected.sums.get(key)) is not None:
             return known[0] if known[1] == first else self.apply("neg", known[0])
         coefficient, base = self.term(self._signed_sum(a, b, sign))
-        self._terms[base] = terms if coefficient > 0 else {x: -c for x, c in terms.items()}
-        self._sums[key] = base, first * coefficient
+        self._collected.terms[base] = terms if coefficient > 0 else {x: -c for x, c in terms.items()}
+        self._collected.sums[key] = base, first * coefficient
         return self.scale(coefficient, base)
 
     def _signed_sum(self, a: int, b: int, sign: int) -> int:
@@ -420,13 +421,15 @@ class Graph:
     def _pythagoras(self, terms: dict[int, float]) -> None:
         """Replace `c*sin(x)**2*y + c*cos(x)**2*y` by `c*y`, in place."""
         for base in list(terms):
-            factors = self._factors.get(base, ())
+            factors = self._collected.factors.get(base, ())
             for k, (sine, other) in enumerate(itertools.pairwise(factors)):
                 if sine != other or self.nodes[sine][0] != "sin":
                     continue
                 rest = factors[:k] + factors[k + 2 :]
                 cosine = self._ids.get(("cos", self.nodes[sine][1], None))
-                partner = None if cosine is None else self._products.get(tuple(sorted([*rest, cosine, cosine])))
+                partner = (
+                    None if cosine is None else self._collected.products.get(tuple(sorted([*rest, cosine, cosine])))
+                )
                 if base in terms and partner in terms and terms[partner] == terms[base]:
                     coefficient = terms.pop(base)
                     del terms[partner]

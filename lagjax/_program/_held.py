@@ -15,18 +15,18 @@ from lagjax._program._differentiation import copy_nodes
 from lagjax._program._graph import Graph
 from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._series import StraightLine
-from lagjax._program._small_equations import Equations, Sparse, constants, dot, drop_entry, transpose
+from lagjax._program._small_equations import Eliminated, Sparse, constants, dot, drop_entry, transpose
 
 
 class Coupled(NamedTuple):
-    """The borders that hold beside A z = r: A z − Σ μₖ actsₖ = r, normalsₖ · z = endₖ; `equations` are those of μ.
+    """The borders that hold, and A z = r: A z − Σ μₖ actsₖ = r, normalsₖ · z = endₖ; `equations` are those of μ.
 
     Of each pivot: its border, its coordinate, 1 where it is free, and the inverse of its slope where the border holds.
     """
 
     acts: list[Sparse]
     normals: list[Sparse]
-    equations: Equations
+    equations: Eliminated
     pivots: list[tuple[int, int, int, int]]
 
     def rename(self, place: Callable[[int], int]) -> "Coupled":
@@ -37,7 +37,7 @@ class Coupled(NamedTuple):
 
         acts, normals, *equations = map(place_rows, (self.acts, self.normals, *self.equations))
         pivots = [(k, i, place(free), place(inverse)) for k, i, free, inverse in self.pivots]
-        return Coupled(acts, normals, Equations(*equations), pivots)
+        return Coupled(acts, normals, Eliminated(*equations), pivots)
 
     def push(self, graph: Graph, right: Sequence[int], mu: Sequence[int]) -> list[int]:
         """r + Σ μₖ actsₖ."""

@@ -99,7 +99,7 @@ class JumpSearch:
         return line.replace(nodes=tuple(nodes))
 
     def _states(self, count: int) -> np.ndarray:
-        """States that nothing speaks for; entries of tables that are parameters increase."""
+        """Random states; entries of tables that are parameters increase."""
         ends = [1 + max(table.positions) for table in self.tables]
         columns = self.draw.uniform(0.3, 1.2, (max([self.beside, *ends]), count))
         columns[: self.moving] *= self.draw.choice([-1.0, 1.0], (self.moving, count))

@@ -7,6 +7,7 @@
     JAX again                         `lax`
     Taylor series                     `recurrence`, or else `slopes`; `is_step`
     machine code                      `llvm`
+    text: C, formulas to read         `c`, `text`, `latex`
     check of a scene                  `side`
 
 The name of an operation is that of the JAX primitive it comes from, if there is one: an elementwise primitive with a
@@ -40,6 +41,8 @@ class Operation:
       argument where a node has one.
     - `llvm`: the name of a function of the C library, called lane by lane; or `(code, *xs)` → value, with a
       `_native.code._ir.Code`, whose values are vectors with the operators of Python. None: this is done elsewhere.
+    - `c`, `text`, `latex`: the expression in C, in Python and in LaTeX, with {0}, {1}, … for its operands; None: a
+      function, by the name that it has in the C library, or here.
     - `lax`: the name of the function in `jax.lax`, if it is not `name`; `_emit` writes what is not there.
     - `simplify(graph, name, *operands)`: a node that is simpler for some operands (see `_simplify`).
     - `commutative`: the order of two operands does not matter.
@@ -70,6 +73,17 @@ class Operation:
     recurrence: Callable | None = None
     cotangents: "tuple[Callable | None, ...]" = ()
     side: Callable | None = None
+    c: str | None = None
+    text: str | None = None
+    latex: str | None = None
+
+    def write_c(self, *operands: str, attribute=None) -> str:
+        """The expression in C, for operands that are names, numbers or stand in brackets."""
+        name = self.llvm if isinstance(self.llvm, str) else self.name
+        form = self.c or self.text
+        if form is None:
+            return f"{name}({', '.join(operands)})"
+        return form.format(*operands, rounds="rint" if attribute == 1 else "round")
 
     def transpose(self) -> "tuple[Callable | None, ...]":
         """`(f, c, g, w, *operands)` → the cotangent, for every operand; empty where it is constant in pieces."""
@@ -193,19 +207,25 @@ def _power_by_exponent(f, c, g, w, u, v):
 # ---- rows that are alike ---------------------------------------------------------------------------------------------
 
 
-def _comparison(name: str, value: Callable, symbol: str, commutative: bool = False) -> Operation:
+def _comparison(name: str, value: Callable, symbol: str, sign: str, commutative: bool = False) -> Operation:
+    latex = f"{{0}} {sign} {{1}}"
     return Operation(
         name, 2, value, lambda code, a, b: code.compare(symbol, a, b), simplify=_simplify.compare,
-        commutative=commutative, is_logical=True, is_step=True, side=_result,
+        commutative=commutative, is_logical=True, is_step=True, side=_result, text=f"{{0}} {symbol} {{1}}", latex=latex,
     )  # fmt: skip
 
 
-def _bitwise(name: str, value: Callable, llvm: Callable, simplify: Callable | None = _simplify.logical) -> Operation:
-    return Operation(name, 2, value, llvm, lax=f"bitwise_{name}", simplify=simplify, commutative=True, is_step=True)
+def _bitwise(
+    name: str, value: Callable, llvm: Callable, sign: str, latex: str, simplify: Callable | None = _simplify.logical
+) -> Operation:
+    return Operation(
+        name, 2, value, llvm, lax=f"bitwise_{name}", simplify=simplify, commutative=True, is_step=True,
+        text=f"({{0}}) {sign} ({{1}})", latex=f"{{0}} {latex} {{1}}",
+    )  # fmt: skip
 
 
-def _step(name: str, value: Callable, llvm: Callable, simplify: Callable | None = None) -> Operation:
-    return Operation(name, 1, value, llvm, simplify=simplify, is_step=True, exact=True, side=_result)
+def _step(name: str, value: Callable, llvm: Callable, simplify: Callable | None = None, **texts: str) -> Operation:
+    return Operation(name, 1, value, llvm, simplify=simplify, is_step=True, exact=True, side=_result, **texts)
 
 
 def _intrinsic(name: str) -> Callable:
@@ -224,14 +244,17 @@ _ROWS = (
     Operation(
         "add", 2, np.add, lambda code, a, b: a + b, simplify=_simplify.add, commutative=True,
         recurrence=_recurrences.add, cotangents=(lambda f, c, g, w, u, v: g, lambda f, c, g, w, u, v: g),
+        c="{0} + {1}",
     ),
     Operation(
         "sub", 2, np.subtract, lambda code, a, b: a - b, simplify=_simplify.subtract,
         recurrence=_recurrences.add, cotangents=(lambda f, c, g, w, u, v: g, lambda f, c, g, w, u, v: f("neg", g)),
+        c="{0} - {1}",
     ),
     Operation(
         "mul", 2, np.multiply, lambda code, a, b: a * b, simplify=_simplify.multiply, commutative=True,
         recurrence=_recurrences.multiply, slopes=(lambda f, c, w, u, v: v, lambda f, c, w, u, v: u),
+        c="{0} * {1}",
     ),
     Operation(
         "div", 2, _divide, lambda code, a, b: a / b, simplify=_simplify.divide,
@@ -240,11 +263,12 @@ _ROWS = (
             lambda f, c, g, w, u, v: f("div", g, v),
             lambda f, c, g, w, u, v: f("neg", f("div", f("mul", g, w), v)),
         ),
+        c="{0} / {1}",
     ),
     Operation(
         "neg", 1, np.negative, lambda code, a: -a, simplify=_simplify.negate, exact=True,
         recurrence=lambda r, i, operands, of: r.order_recursion.apply("neg", of[0]),
-        cotangents=(lambda f, c, g, w, u: f("neg", g),),
+        cotangents=(lambda f, c, g, w, u: f("neg", g),), c="-{0}",
     ),
     Operation(
         "rem", 2, _remainder, "fmod", exact=True, recurrence=_recurrences.remainder,
@@ -264,7 +288,7 @@ _ROWS = (
     _function("sqrt", np.sqrt, lambda f, c, w, u: f("div", c(0.5), w), _intrinsic("sqrt"), steep=True,
               simplify=_simplify.root, recurrence=_recurrences.square_root),
     _function("rsqrt", lambda x: 1 / np.sqrt(x), lambda f, c, w, u: f("div", f("mul", c(-0.5), w), u),
-              lambda code, a: 1.0 / code.intrinsic("sqrt", a), simplify=_simplify.root),
+              lambda code, a: 1.0 / code.intrinsic("sqrt", a), simplify=_simplify.root, c="1.0 / sqrt({0})"),
     _function("cbrt", np.cbrt, lambda f, c, w, u: f("div", w, f("mul", c(3.0), u)), simplify=_odd, steep=True),
     # Exponentials
     _function("exp", np.exp, lambda f, c, w, u: w),
@@ -273,7 +297,7 @@ _ROWS = (
     _function("log", np.log, lambda f, c, w, u: _inverse(f, c, u)),
     _function("log1p", np.log1p, lambda f, c, w, u: _inverse(f, c, _one_plus(f, c, u))),
     _function("logistic", lambda x: 1 / (1 + np.exp(-x)), lambda f, c, w, u: f("sub", w, _square(f, w)),
-              lambda code, a: 1.0 / (1.0 + code.library("exp", -a))),
+              lambda code, a: 1.0 / (1.0 + code.library("exp", -a)), c="1.0 / (1.0 + exp(-{0}))"),
     _function("erf", np.vectorize(math.erf, otypes=[float]), lambda f, c, w, u: _gauss(f, c, u), simplify=_odd),
     _function("erfc", np.vectorize(math.erfc, otypes=[float]), lambda f, c, w, u: f("neg", _gauss(f, c, u))),
     # Circular functions
@@ -304,6 +328,7 @@ _ROWS = (
     # Pieces
     Operation(
         "abs", 1, np.abs, _intrinsic("fabs"), simplify=_even, exact=True, recurrence=_recurrences.absolute,
+        c="fabs({0})", latex=r"\left|{0}\right|",
         slopes=(lambda f, c, w, u: f("select", f("ge", u, c(0.0)), c(-1.0), c(1.0)),),  # at zero too, as in JAX
         side=lambda f, c, w, u: f("ge", u, c(0.0)),
     ),
@@ -311,26 +336,28 @@ _ROWS = (
         "max", 2, np.maximum, _intrinsic("maximum"), simplify=_simplify.extremum, commutative=True, exact=True,
         recurrence=_recurrences.extremum("gt"),
         cotangents=(lambda f, c, g, w, u, v: _share(f, c, g, u, v), lambda f, c, g, w, u, v: _share(f, c, g, v, u)),
-        side=_is_larger,
+        side=_is_larger, c="maximum({0}, {1})", latex=r"\max\left({0}, {1}\right)",
     ),
     Operation(
         "min", 2, np.minimum, _intrinsic("minimum"), simplify=_simplify.extremum, commutative=True, exact=True,
         recurrence=_recurrences.extremum("lt"),
         cotangents=(lambda f, c, g, w, u, v: _share(f, c, g, v, u), lambda f, c, g, w, u, v: _share(f, c, g, u, v)),
-        side=_is_larger,
+        side=_is_larger, c="minimum({0}, {1})", latex=r"\min\left({0}, {1}\right)",
     ),
-    _step("sign", np.sign, lambda code, x: code.select(x > 0.0, 1.0, code.select(x < 0.0, -1.0, x)), _odd),
-    _step("floor", np.floor, _intrinsic("floor")),
-    _step("ceil", np.ceil, _intrinsic("ceil")),
+    _step("sign", np.sign, lambda code, x: code.select(x > 0.0, 1.0, code.select(x < 0.0, -1.0, x)), _odd,
+          c="({0} > 0.0 ? 1.0 : {0} < 0.0 ? -1.0 : {0})"),
+    _step("floor", np.floor, _intrinsic("floor"), latex=r"\left\lfloor{0}\right\rfloor"),
+    _step("ceil", np.ceil, _intrinsic("ceil"), latex=r"\left\lceil{0}\right\rceil"),
     _step("trunc", np.trunc, _intrinsic("trunc")),
     # The largest power of two that is at most |x|, and 1 for 0: for weights that do not change what is computed with
     # them. It has therefore no side: no step has to end where it jumps.
     Operation(
         "binade", 1, _binade,
         lambda code, x: code.library("exp2", code.library("logb", code.select(code.compare("==", x, 0.0), 1.0, x))),
-        is_step=True, exact=True,
+        is_step=True, exact=True, c="exp2(logb({0} == 0.0 ? 1.0 : {0}))",
     ),
-    _step("round", _round, lambda code, x, method: code.intrinsic("rint" if method == 1 else "round", x)),
+    _step("round", _round, lambda code, x, method: code.intrinsic("rint" if method == 1 else "round", x),
+          c="{rounds}({0})"),
     Operation(
         "select", 3, _select, lambda code, predicate, no, yes: code.select(predicate, yes, no), lax="select_n",
         simplify=_simplify.select, exact=True, recurrence=_recurrences.select,
@@ -339,6 +366,8 @@ _ROWS = (
             lambda f, c, g, w, p, no, yes: _where(f, p, c(0.0), g),
             lambda f, c, g, w, p, no, yes: _where(f, p, g, c(0.0)),
         ),
+        c="({0} ? {2} : {1})", text="where({0}, {2}, {1})",
+        latex=r"\begin{{cases}} {2} & {0} \\ {1} & \text{{otherwise}} \end{{cases}}",
     ),
     Operation(
         "convert", 1, lambda x, kind: x, None, lax="convert_element_type", simplify=_simplify.convert, exact=True,
@@ -347,22 +376,26 @@ _ROWS = (
     # Logic
     Operation(
         "is_finite", 1, np.isfinite, lambda code, x: code.intrinsic("fabs", x) < float("inf"), is_logical=True,
-        is_step=True,
+        is_step=True, c="fabs({0}) < INFINITY",
     ),
-    _comparison("eq", np.equal, "==", commutative=True),
-    _comparison("ne", np.not_equal, "!=", commutative=True),
-    _comparison("lt", np.less, "<"),
-    _comparison("le", np.less_equal, "<="),
-    _comparison("gt", np.greater, ">"),
-    _comparison("ge", np.greater_equal, ">="),
+    _comparison("eq", np.equal, "==", "=", commutative=True),
+    _comparison("ne", np.not_equal, "!=", "\\ne", commutative=True),
+    _comparison("lt", np.less, "<", "<"),
+    _comparison("le", np.less_equal, "<=", "\\le"),
+    _comparison("gt", np.greater, ">", ">"),
+    _comparison("ge", np.greater_equal, ">=", "\\ge"),
     # u > v, where it chooses between two ways to the same number: it has no side, and no step ends where it jumps.
     Operation(
-        "prefers", 2, np.greater, lambda code, a, b: code.compare(">", a, b), lax="gt", is_logical=True, is_step=True
+        "prefers", 2, np.greater, lambda code, a, b: code.compare(">", a, b), lax="gt", is_logical=True, is_step=True,
+        text="{0} > {1}", latex="{0} > {1}",
     ),
-    _bitwise("and", np.bitwise_and, lambda code, a, b: a & b),
-    _bitwise("or", np.bitwise_or, lambda code, a, b: a | b),
-    _bitwise("xor", np.bitwise_xor, lambda code, a, b: (a | b) & ~(a & b), simplify=None),
-    Operation("not", 1, np.invert, lambda code, a: ~a, lax="bitwise_not", simplify=_simplify.invert, is_step=True),
+    _bitwise("and", np.bitwise_and, lambda code, a, b: a & b, "&", r"\land"),
+    _bitwise("or", np.bitwise_or, lambda code, a, b: a | b, "|", r"\lor"),
+    _bitwise("xor", np.bitwise_xor, lambda code, a, b: (a | b) & ~(a & b), "^", r"\oplus", simplify=None),
+    Operation(
+        "not", 1, np.invert, lambda code, a: ~a, lax="bitwise_not", simplify=_simplify.invert, is_step=True,
+        c="!{0}", text="~({0})", latex=r"\lnot {0}",
+    ),
 )  # fmt: skip
 
 # What may come near the largest double where nothing else does, and what does not whatever its operand is.

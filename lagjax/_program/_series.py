@@ -100,29 +100,28 @@ def series(program: Recurrent, size: int, moving: int, followed: Sequence[int] =
     an operation whose series is not known here.
     """
     with np.errstate(all="ignore"):  # a constant may be 1/0, where the mass matrix is singular: that is found later
-        return _Recurrences(program, size, moving, tuple(followed)).finish()
+        outputs = list(program.line.outputs)
+        return _Recurrences(program, size, moving, followed).finish(outputs, size, list(followed))
 
 
 class _Recurrences:
     """Two growing graphs: the program with derivatives g, and what is linear in the coefficients of order k."""
 
-    def __init__(self, program: Recurrent, size: int, moving: int, followed: tuple[int, ...]):
-        self.size, self.moving, self.followed = size, moving, followed
+    def __init__(self, program: Recurrent, size: int, moving: int, followed: Sequence[int]):
+        self.moving = moving
         budget = _LARGEST_SERIES * len(program.line.nodes) + 1000
         self.zeroth_order, self.order_recursion = Graph.from_line(program.line, budget), Graph(budget)
         self.number = self.zeroth_order.number
         # What overflows where it no longer matters has no coefficients there: infinite ones would be no numbers.
         self.hides_growth = self.zeroth_order.hides_growth
-        self.outputs = list(program.line.outputs)
-        self.order_k = [self.order_recursion.input(i, "float") for i in range(self.moving)]
-        self.k, self.inverse_k = (self.order_recursion.input(self.moving + i, "float") for i in range(2))
+        *_, self.k, self.inverse_k = (self.order_recursion.input(i, "float") for i in range(moving + 2))
         self._given: dict[tuple, int] = {}  # what else is read: ("value", node) or ("product", row, row)
         self._rows: dict[tuple[int | _Component, bool], int] = {}
         self._coefficients: dict[int, int | _Unknown | None] = {}  # None: constant along the motion
         self.steep: set[int] = set()  # slopes that may be infinite where the function itself is not
         # Of an elimination no coefficient is needed: it is most of a large program.
         linear = program.linear
-        self._find((linear and linear.read) or self.outputs[:size])
+        self._find((linear and linear.read) or list(program.line.outputs[:size]))
         self._find_added(len(program.line.nodes))
         self.solution = [] if program.linear is None else self._solution(program.linear)
         if program.linear is not None:  # what is followed may depend on it
@@ -190,7 +189,7 @@ class _Recurrences:
     def _coefficient(self, i: int) -> "int | _Unknown | None":
         op, operands, attribute = self.zeroth_order.nodes[i]
         if op == "input":
-            return self.order_k[attribute] if attribute < self.moving else None
+            return self.order_recursion.input(attribute, "float") if attribute < self.moving else None
         if op == "constant" or self.zeroth_order.kinds[i] != "float" or OPERATIONS[op].is_step:
             return None
         of = [self.coefficient(operand) for operand in operands]
@@ -267,10 +266,10 @@ class _Recurrences:
 
     # ---- the end: only what the outputs need ----
 
-    def finish(self) -> Series:
+    def finish(self, outputs: list[int], size: int, followed_nodes: list[int]) -> Series:
         """Both graphs, without the products and values that nothing needs."""
-        rates = self.solution[: self.size] or [self._output_coefficient(i) for i in self.outputs[: self.size]]
-        followed = [self._output_coefficient(i) for i in self.followed]
+        rates = self.solution[:size] or [self._output_coefficient(i) for i in outputs[:size]]
+        followed = [self._output_coefficient(i) for i in followed_nodes]
         rows = list(self._rows)
         needed: set[int] = set()
         while True:
@@ -291,10 +290,10 @@ class _Recurrences:
             if key is not None:
                 self.order_recursion.nodes[self._given[key]] = "input", (), self.moving + 2 + k
         kept = [self._row_coefficient(*rows[r]) for r in sorted(needed)] + followed
-        values += self.followed
+        values += followed_nodes
         return Series(
-            self.size,
-            eliminate_dead_code(*sink_negations(self.zeroth_order, self.outputs + values)),
+            size,
+            eliminate_dead_code(*sink_negations(self.zeroth_order, outputs + values)),
             eliminate_dead_code(*sink_negations(self.order_recursion, rates + kept)),
             len(values),
             tuple((place[a], place[b]) for _, a, b in products),

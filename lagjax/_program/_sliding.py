@@ -26,7 +26,7 @@ from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._series import LinearSystem, StraightLine
 from lagjax._program._small_equations import (
     SOFT,
-    Equations,
+    Eliminated,
     Sparse,
     constants,
     dot,
@@ -166,7 +166,7 @@ class _SlidingForces:
         every = [functools.reduce(lambda a, b: self.f("and", a, b), of, flag) for flag, of in of_slides]
         return [every[row.slide] for row in self.rows.rows]
 
-    def _retract(self, held: Held, equations: Equations, effects, pushed, missing):
+    def _retract(self, held: Held, equations: Eliminated, effects, pushed, missing):
         """The retraction, and the coordinates that each row moves."""
         by_position = [k for k in range(len(pushed)) if self.rows.order(k) > 1]
         if by_position:
@@ -260,7 +260,7 @@ class _SlidingForces:
             effects.append({m: x for m, x in row.items() if x != self.zero})
         return responses, effects
 
-    def _equations(self, effects: list[Sparse], pushed: Sequence[int], slopes: Sequence[Sparse]) -> Equations:
+    def _equations(self, effects: list[Sparse], pushed: Sequence[int], slopes: Sequence[Sparse]) -> Eliminated:
         """The linear equations of μ; μ = 0 where there is nothing to do."""
         f, rows = self.f, []
         for k, row in enumerate(effects):
@@ -272,10 +272,10 @@ class _SlidingForces:
             whole = [dict(row) for row in rows]
             for k, row in enumerate(rows):
                 row[k] = f("mul", self.graph.number(1 + SOFT), row[k])
-        return Equations(eliminate(self.graph, rows), whole)
+        return Eliminated(eliminate(self.graph, rows), whole)
 
     def _pushes_back(self, j: int, effects, pushed: Sequence[int], missing: Sequence[int]) -> int:
-        """True where border j of positions pushes back what lies beside it; other borders may hold that there, too."""
+        """True where border j of positions pushes back what lies next to it; other borders may hold that there, too."""
         f, others = self.f, [k for k in range(len(pushed)) if k != j]
         if all(self.rows.order(k) > 1 for k in others):
             return pushed[j]
@@ -295,7 +295,7 @@ class _SlidingForces:
             stays = f("and", stays, f("le", moves, f("mul", self.graph.number(STILL), f("abs", own))))
         return f("and", pushed[j], f("not", stays))
 
-    def _unknown(self, equations: Equations, missing: list[int]) -> list[int]:
+    def _unknown(self, equations: Eliminated, missing: list[int]) -> list[int]:
         """μ; where borders share what they hold, μ − 1 is to be small: the distance from the middle of both sides."""
         if not equations.whole:
             return equations.solve(self.graph, missing)

@@ -4,19 +4,18 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from lagjax._program._graph import Graph
 
-# Borders that are not independent share what they hold as if they yielded by so much, relative; what that leaves is
-# mended this many times. The share of what no border holds alone is as exact as rounding, divided by it.
+# Borders that are not independent share what they hold as if they yielded by `SOFT`, relative; the remaining error is
+# corrected `MENDED` times. The share of what no border holds alone is as exact as rounding, divided by it.
 SOFT, MENDED = 1e-9, 2
 
 Sparse = dict[int, int]  # the nodes of a vector by their place in it; what is not there is zero
 
 
-class Equations(NamedTuple):
+class Eliminated(NamedTuple):
     """Linear equations after `eliminate`, and as they are where they are solved softly (`SOFT`)."""
 
     factors: list[Sparse]
@@ -56,8 +55,8 @@ def find_groups(rows: Sequence[Sparse], count: int) -> list[int]:
     """The group of each row: rows of different groups have no column in common, of `count`."""
     places = np.array([(k, len(rows) + i) for k, row in enumerate(rows) for i in row], int).reshape(-1, 2).T
     size = len(rows) + count
-    graph = coo_array((np.ones(places.shape[1]), tuple(places)), (size, size))
-    return connected_components(graph, directed=False)[1][: len(rows)].tolist()
+    graph = scipy.sparse.coo_array((np.ones(places.shape[1]), tuple(places)), (size, size))
+    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1][: len(rows)].tolist()
 
 
 def sparse_row(graph: Graph, xs: Iterable[int]) -> Sparse:

@@ -2,10 +2,11 @@
 
 `_simulate` holds `simulate` and `simulate_batch`, `_crossings` the instants at which a function of the state changes
 sign, `hybrid/` motions through modes, `contacts/` those with contacts, `jumps/` what these two share. `_trajectory` is
-what they return, `_batch_members` its members along one axis.
+what they return, `_batch_members` its members along one axis, `_states_between` its states between the outputs.
 """
 
 from lagjax._run._batch_members import Members
 from lagjax._run._crossings import Crossings, crossings, directions_of, restore_crossings, sections_of, surfaces_in
 from lagjax._run._simulate import simulate, simulate_batch, trajectory_of
+from lagjax._run._states_between import find_states
 from lagjax._run._trajectory import CHANGE_WORDS, ContactChanges, Impacts, State, Trajectory, Transitions

@@ -5,15 +5,56 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from lagjax._interface import Layout, numbers_at
-from lagjax._run._trajectory import Trajectory
+from lagjax._interface import Layout, is_concrete, numbers_at
+from lagjax._run._trajectory import EACH, Trajectory
 
 PyTree = Any
 
 
 _SHARED = "shared"  # stands for the batch axis of what all members share
+
+
+def _numbers_in_front(trajectory: Trajectory, batch: tuple[int, ...]) -> tuple[PyTree, PyTree]:
+    """The numbers in params with the axes of the batch in front, of size 1 where members share them; and the rest."""
+    axes, rank = trajectory.params_axes, len(batch)
+    # Of the axes of a batch, the innermost may share some parameters (`Trajectory.map_members`).
+    outer = rank - (rank > 0 and axes != EACH)
+    numbers, code = eqx.partition(trajectory.params, eqx.is_array_like)
+    if outer == rank:
+        axes = EACH
+    axis_of_leaf = jax.tree.map(
+        lambda axis, part: jax.tree.map(lambda _: _SHARED if axis is None else axis, part),
+        axes, numbers, is_leaf=lambda axis: axis is None,
+    )  # fmt: skip
+
+    def move(leaf, axis):
+        library: Any = np if is_concrete(leaf) else jnp
+        leaf = library.asarray(leaf)
+        if outer == rank:
+            return leaf
+        if axis is _SHARED:
+            return library.expand_dims(leaf, outer)
+        return library.moveaxis(leaf, axis + outer if axis >= 0 else axis, outer)
+
+    return jax.tree.map(move, numbers, axis_of_leaf), code
+
+
+def spread_params(trajectory: Trajectory, member: np.ndarray) -> tuple[PyTree, PyTree]:
+    """The params of lanes that follow a `member` (L,) each, and the axis of lanes for each leaf, None where shared."""
+    batch = np.shape(trajectory.result._value)
+    numbers, code = _numbers_in_front(trajectory, batch)
+
+    def lanes(x):
+        own = x.shape[len(batch) :]
+        if math.prod(x.shape[: len(batch)]) == 1:
+            return x.reshape(own)
+        return (np if is_concrete(x) else jnp).broadcast_to(x, batch + own).reshape(-1, *own)[member]
+
+    axes = jax.tree.map(lambda x: None if math.prod(x.shape[: len(batch)]) == 1 else 0, numbers)
+    return eqx.combine(jax.tree.map(lanes, numbers), code), axes
 
 
 class Members:
@@ -22,26 +63,14 @@ class Members:
         self.count, rank = math.prod(self.batch), len(self.batch)
         first = jax.tree.map(lambda leaf: numbers_at(leaf, (0,) * (rank + 1)), (trajectory.q, trajectory.qdot))
         self.layout, self.trajectory = Layout.from_state(*first), trajectory
-        # Of the axes of a batch, the innermost shares times and some parameters (`Trajectory.map_members`).
-        self._outer = rank - (rank > 0 and np.ndim(trajectory.ts) < 1 + rank)
         self.numbers, self.params = self._parameters()
 
     def _parameters(self) -> tuple[list[np.ndarray], PyTree]:
         """Every number in params, () where all members share it, else (N,); and the params of one member."""
-        axes = self.trajectory.params_axes
-        numbers, code = eqx.partition(self.trajectory.params, eqx.is_array_like)
-        axis_of_leaf = jax.tree.map(
-            lambda axis, part: jax.tree.map(lambda _: _SHARED if axis is None else axis, part),
-            axes, numbers, is_leaf=lambda axis: axis is None,
-        )  # fmt: skip
+        numbers, code = _numbers_in_front(self.trajectory, self.batch)
         leaves, structure = jax.tree.flatten(numbers)
         columns, of_one = [], []
-        for leaf, axis in zip(leaves, jax.tree.leaves(axis_of_leaf), strict=True):
-            each = np.asarray(leaf)
-            if self._outer < len(self.batch) and axis is _SHARED:
-                each = np.expand_dims(each, self._outer)
-            elif self._outer < len(self.batch):
-                each = np.moveaxis(each, axis + self._outer if axis >= 0 else axis, self._outer)
+        for each in leaves:
             leading, shape = each.shape[: len(self.batch)], each.shape[len(self.batch) :]
             of_one.append(each[(0,) * len(self.batch)])
             if math.prod(leading) == 1:

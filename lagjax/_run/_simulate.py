@@ -9,24 +9,25 @@ import dataclasses
 import functools
 import os
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine import AbstractEngine, Batch, Problem, Solution, axes_per_leaf, choose, requested_engine
-from lagjax._engine.diffrax import Diffrax
 from lagjax._engine.taylor import MachineCode
 from lagjax._equations import has_constraints, inconsistent_members, require_consistent
 from lagjax._interface import ENDED_WELL, RESULTS, Layout, advice, as_arrays, halves, require_flag, result_from
 from lagjax._primitives import marks_absent
-from lagjax._run._trajectory import State, Trajectory, raise_unless_ok, step_counts
+from lagjax._run._trajectory import EACH, RunSettings, State, Trajectory, raise_unless_ok, step_counts
 from lagjax._run.contacts import follow_contacts, follow_contacts_batch
 from lagjax._run.hybrid import Hybrid, follow_modes
 from lagjax._scene import System, lift_batch, lift_problem, require_system
+
+if TYPE_CHECKING:
+    import diffrax
 
 PyTree = Any
 
@@ -65,16 +66,16 @@ def simulate(
     ts: jax.Array | np.ndarray,
     params: PyTree = None,
     *,
-    solver: diffrax.AbstractSolver | MachineCode | None = None,
+    solver: "diffrax.AbstractSolver | MachineCode | None" = None,
     rtol: float | None = None,
     atol: float | None = None,
     dt: float | None = None,
     max_steps: int = 65_536,
     max_transitions: int | None = None,
-    event: Callable | diffrax.Event | None = None,
-    adjoint: diffrax.AbstractAdjoint | None = None,
+    event: "Callable | diffrax.Event | None" = None,
+    adjoint: "diffrax.AbstractAdjoint | None" = None,
     throw: bool = True,
-    progress: bool | diffrax.AbstractProgressMeter = False,
+    progress: "bool | diffrax.AbstractProgressMeter" = False,
 ) -> Trajectory:
     r"""The motion of `system` from (q0, qdot0) at `ts[0]`, at the times `ts`.
 
@@ -192,8 +193,7 @@ def simulate(
     trajectory = trajectory_of(given, engine, solution, given.y0, given.params)
     if not throw or (isinstance(solution.result, np.integer) and solution.result in ENDED_WELL):
         return trajectory
-    implicit = isinstance(engine, Diffrax) and isinstance(engine.solver, diffrax.AbstractImplicitSolver)
-    return raise_unless_ok(trajectory, layout, lambda: advice(trajectory.result, implicit))
+    return raise_unless_ok(trajectory, layout, lambda: advice(trajectory.result, engine.is_implicit))
 
 
 @_translate_keywords
@@ -206,15 +206,15 @@ def simulate_batch(
     params: PyTree = None,
     *,
     batch_axes: tuple[PyTree, PyTree, PyTree] = (0, 0, None),
-    solver: diffrax.AbstractSolver | MachineCode | None = None,
+    solver: "diffrax.AbstractSolver | MachineCode | None" = None,
     rtol: float | None = None,
     atol: float | None = None,
     dt: float | None = None,
     max_steps: int = 65_536,
     max_transitions: int | None = None,
-    event: Callable | diffrax.Event | None = None,
-    adjoint: diffrax.AbstractAdjoint | None = None,
-    progress: bool | diffrax.AbstractProgressMeter = False,
+    event: "Callable | diffrax.Event | None" = None,
+    adjoint: "diffrax.AbstractAdjoint | None" = None,
+    progress: "bool | diffrax.AbstractProgressMeter" = False,
 ) -> Trajectory:
     """The motion of many members of one scene at once: the same numbers as `jax.vmap` over `simulate`.
 
@@ -222,6 +222,9 @@ def simulate_batch(
     integer, None for an argument that all members share, or a pytree of these. The default is a batch of initial
     states; a sweep over parameters from one initial state is `batch_axes=(None, None, 0)`, and over one of them
     `batch_axes=(None, None, {"m": 0, "l": None})`. In the result the members are the first axis.
+
+    `ts` are the output times (T,) of all members, or (members, T): a row for each, which may begin, end and run as it
+    likes, forward or backward. The `ts` of the trajectory have that shape, too.
 
     A `Hybrid` runs under `jax.vmap`: inside of a `jax.jit` of your own it is compiled once.
 
@@ -238,12 +241,14 @@ def simulate_batch(
     """
     of_engines = {"solver": solver, "dt": dt, "event": event, "adjoint": adjoint, "progress": progress}
     values = {"q0": q0, "qdot0": qdot0, "params": params}
-    axes, size = axes_per_leaf(values, batch_axes)
+    axes, size = axes_per_leaf(values, batch_axes, ts)
     if isinstance(system, Hybrid):
         options = of_engines | {"rtol": rtol, "atol": atol, "max_steps": max_steps, "max_transitions": max_transitions}
         follow = functools.partial(simulate, system, throw=False, **options)
-        run = jax.vmap(lambda q0, qdot0, params: follow(q0, qdot0, ts, params), batch_axes)(q0, qdot0, params)
-        return dataclasses.replace(run, ts=run.ts[0], params=params, params_axes=batch_axes[2])
+        of_ts = 0 if np.ndim(ts) == 2 else None
+        run = jax.vmap(follow, (*batch_axes[:2], of_ts, batch_axes[2]))(q0, qdot0, jnp.asarray(ts), params)
+        ts = run.ts[0] if of_ts is None else run.ts
+        return dataclasses.replace(run, ts=ts, params=params, params_axes=batch_axes[2])
     system = require_system(system, contacts=True)
     if system.touches:
         _refuse_options("a scene with contacts", of_engines)
@@ -259,16 +264,16 @@ def simulate_batch(
         )
         raise
     values = {name: as_arrays(value, batch.member.layout.dtype, name) for name, value in values.items()}
-    inconsistent = inconsistent_members(system, batch.member.layout, batch.member.ts, values, axes)
+    inconsistent = inconsistent_members(system, batch.member.layout, batch.whole.ts, values, axes)
     of_params = values["params"], batch_axes[2]
     if engine is None:
         trajectory = follow_contacts_batch(given, batch, max_transitions, *of_params)
     else:
-        trajectory = trajectory_of(given.member, engine, engine.solve_batch(batch), given.y0, *of_params)
+        trajectory = trajectory_of(given.whole, engine, engine.solve_batch(batch), given.y0, *of_params)
     return trajectory if inconsistent is None else _mask_inconsistent(trajectory, inconsistent)
 
 
-def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, y0, params: PyTree, params_axes=None):
+def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, y0, params: PyTree, params_axes=EACH):
     """The solution of a problem, or a batch, in the pytree of the user; `y0` and `params` are those of all members."""
     # Where nothing is traced, the few numbers stay in NumPy: each one sent to JAX costs as much as ten steps.
     restore, (q, qdot), (q_end, qdot_end) = problem.layout.restore, halves(solution.path), halves(solution.y_end)
@@ -280,14 +285,15 @@ def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, 
     stats = step_counts(solution.accepted, solution.rejected)
     if solution.idle is not None:
         stats["num_wasted_lane_steps"] = solution.idle
-    fixed_steps, event = isinstance(engine, Diffrax) and engine.dt is not None, None
+    event = None
     if problem.event is not None:
-        of, ended = jax.tree.structure(problem.event.cond_fn, is_leaf=callable), jnp.asarray(solution.event)
+        of, ended = jax.tree.structure(problem.event.conditions, is_leaf=callable), jnp.asarray(solution.event)
         event = of.unflatten([ended[..., k] for k in range(of.num_leaves)])
     return Trajectory.from_fields(
         ts=ts, q=q, qdot=qdot, result=result_from(result), end=State(solution.t_end, restore(q_end), restore(qdot_end)),
-        stats=stats, system=problem.system, params=params, params_axes=params_axes, engine=type(engine).__name__,
-        tolerances=None if fixed_steps else engine.tolerances(problem, y0), event=event,
+        stats=stats, system=problem.system, params=params, params_axes=params_axes,
+        settings=RunSettings.from_problem(problem, engine),
+        tolerances=engine.tolerances(problem, y0), event=event,
     )  # fmt: skip
 
 

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._engine import Problem
+from lagjax._engine import AbstractEngine, Problem
 from lagjax._equations import has_constraints
-from lagjax._interface import ENDED_WELL, RESULTS, Layout, SimulationError, is_known, registered, show_str
+from lagjax._interface import ENDED_WELL, RESULTS, Layout, SimulationError, is_concrete, is_known, registered, show_str
 from lagjax._primitives import DOUBLE, compute_in_doubles, marks_absent, raise_where_failed
 from lagjax._scene import System
 
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 PyTree = Any
 Number = jax.Array | np.ndarray
+
+
+EACH = "each"  # in place of axes of params: every motion has its own, as under `jax.vmap(simulate)`
 
 
 class State(NamedTuple):
@@ -169,6 +172,42 @@ class ContactChanges(NamedTuple):
         return registered().change_frame(self)
 
 
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True, eq=False)
+class RunSettings:
+    """How a motion was integrated: what another run of its scene needs. Equal to one with equal values.
+
+    - `engine`: what integrated it; None where numbers of its solver were being traced.
+    - `tolerances`: rtol and atol as they were given; None where they were being traced.
+    - `max_steps`, `max_transitions`: the budgets of a run; `transitions`: those of a `Hybrid`.
+    """
+
+    engine: AbstractEngine | None
+    tolerances: tuple[float | None, float | None] | None
+    max_steps: int
+    max_transitions: int | None = None
+    transitions: tuple = ()
+
+    @classmethod
+    def from_problem(cls, problem: Problem, engine: AbstractEngine, **more: Any) -> "RunSettings":
+        known = all(map(is_concrete, jax.tree.leaves(engine)))
+        numbers = problem.tolerances if all(map(is_concrete, problem.tolerances)) else None
+        tolerances = numbers and tuple(None if x is None else float(x) for x in numbers)
+        return cls(engine if known else None, tolerances, problem.max_steps, **more)
+
+    @functools.cached_property
+    def _key(self) -> tuple:
+        leaves, structure = jax.tree.flatten(self.engine)
+        numbers = [(np.shape(x), np.asarray(x).tobytes()) if eqx.is_array_like(x) else x for x in leaves]
+        return structure, *numbers, self.tolerances, self.max_steps, self.max_transitions, self.transitions
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, RunSettings) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
 class Trajectory(eqx.Module):
     """The motion of a system at the times `ts`, one trajectory or a batch of them.
 
@@ -181,7 +220,8 @@ class Trajectory(eqx.Module):
       step before it failed.
     - `stats`: counts of steps, per member: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
     - `tolerances`: rtol and atol of a step; None where it had a fixed size.
-    - `engine`: the engine that integrated it, "MachineCode" or "Diffrax"; "" for a hybrid motion.
+    - `engine`: the engine that integrated it, "MachineCode" or "Diffrax"; "" for a hybrid motion. `settings` are its
+      options, for `at`.
     - `mode`, `transitions`: for the motion of a `Hybrid` the mode at every output time and its
       `Transitions`; otherwise None. `system` is then the dict of modes, and quantities are those of the mode at every
       time, NaN where the mode is −1. A mode is a place in `mode_names`, because the dict loses its order in `jax.jit`.
@@ -199,12 +239,12 @@ class Trajectory(eqx.Module):
     stats: dict[str, jax.Array]
     system: System | dict[str, System]
     params: PyTree
-    params_axes: PyTree = eqx.field(static=True, default=None)  # how `simulate_batch` mapped over params
+    params_axes: PyTree = eqx.field(static=True, default=EACH)  # how `simulate_batch` mapped over params
     mode: jax.Array | None = None
     transitions: "Transitions | None" = None
     mode_names: tuple[str, ...] = eqx.field(static=True, default=())
     tolerances: tuple[Number, Number] | None = None
-    engine: str = eqx.field(static=True, default="")
+    settings: RunSettings | None = None
     impacts: "Impacts | None" = None
     contacts: Any = None
     contact_changes: "ContactChanges | None" = None
@@ -238,10 +278,44 @@ class Trajectory(eqx.Module):
         return registered().trajectory_html(self)
 
     @property
+    def engine(self) -> str:
+        if self.settings is None or self.mode is not None:
+            return ""
+        return "Diffrax" if self.settings.engine is None else type(self.settings.engine).__name__
+
+    @property
     def ok(self) -> jax.Array:
         """True where a member reached the last time or its event."""
         code = self.result._value
         return (code == RESULTS.successful._value) | (code == RESULTS.event_occurred._value)
+
+    @marks_absent
+    def at(self, t) -> State:
+        """The states at times t between the outputs, as exact as these: each by a run from the output before it.
+
+        q(t), q̇(t) for t in [ts[0], ts[-1]]: a number or an array of any shape. In the `State` the axes of t stand in
+        front of those of a leaf, behind the axes of the batch. For a batch of shape B, t is a number or times (K,) for
+        all members, or what broadcasts with (*B, K): (*B, K) or (*B, 1) for times of each. All times are followed at
+        once, as one batch, by the engine, the tolerances and budgets of the motion; its event is left out.
+
+        A time that is an output gives that output. NaN where the motion had not come to, or had ended by an event or a
+        failure, as at the outputs there. At the time of an impact or a transition it is the state that `simulate` gives
+        for an output then. Under every transformation of JAX; the derivative by t is (q̇, q̈), that by q0 and params is
+        the derivative of the motion.
+
+        **Raises** `ValueError` for t outside of [ts[0], ts[-1]], within `jax.jit` it is NaN there; for a trajectory
+        without its system. `SimulationError` where the motion cannot be followed from an output.
+
+        ```python
+        import jax.numpy as jnp, lagjax
+
+        spring = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
+        run = lagjax.simulate(spring, 1.0, 0.0, jnp.linspace(0.0, 10.0, 11))
+        assert abs(run.at(2.5).q - jnp.cos(2.5)) < 1e-6
+        ```
+        """
+        self._require_present()
+        return registered().find_states(self, t)
 
     def energy(self) -> jax.Array:
         """h = p·q̇ − L at every output time, shape (T,) or (batch, T)."""
@@ -380,10 +454,11 @@ class Trajectory(eqx.Module):
             return function(q, qdot, times_and_tolerances, eqx.combine(numbers, code), mode, *more)
 
         for outer in range(rank):
-            # The innermost batch axis of `simulate_batch` shares its times and some parameters; axes that the user's
-            # own `jax.vmap(simulate)` added are on everything.
-            shared = outer == 0 and self.ts.ndim < 1 + rank
-            axes = (None, self.params_axes) if shared else (0, 0)
+            # The innermost batch axis of `simulate_batch` shares its tolerances, some parameters, and mostly its times;
+            # axes that the user's own `jax.vmap(simulate)` added are on everything.
+            axes = (0, 0), 0
+            if outer == 0 and self.params_axes != EACH:
+                axes = (0 if self.ts.ndim == 1 + rank else None, None), self.params_axes
             mapped = jax.vmap(mapped, in_axes=(0, 0, *axes, 0, *[0] * len(more)))
         return mapped(self.q, self.qdot, (self.ts, self.tolerances), numbers, self.mode, *more)
 
@@ -453,21 +528,22 @@ def follow_in_doubles(motion: Callable, problem: Problem, *more) -> Any:
 
 def follow_in_numbers(follow: Callable, problem: Problem, *more) -> Any:
     """`follow_rows` of the one member of a problem, without the axis of members."""
-    found = follow_rows(follow, problem, np.asarray(problem.y0)[None], np.asarray(problem.vector)[None], *more)
+    rows = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
+    found = follow_rows(follow, problem, *rows, *more)
     return jax.tree.map(lambda x: np.asarray(x)[0], found)
 
 
-def follow_rows(follow: Callable, member: Problem, y0, vectors, *more) -> Any:
+def follow_rows(follow: Callable, member: Problem, ts, y0, vectors, *more) -> Any:
     """`follow(layout, params, ts, y0, vectors, *more)` of members whose numbers are known, in the own precision.
 
-    There are `y0` (N, 2n) and `vectors` (N, P), or (1, P); the rest is that of one `member`.
+    There are `ts` (N, T) or (1, T), `y0` (N, 2n), `vectors` (N, P) or (1, P); the rest is that of one `member`.
     """
 
     def run(ts, y0, vectors):
         wide = member.double_precision if member.is_single else member
         return follow(wide.layout, wide.params, ts, y0, vectors, *more)
 
-    given = np.asarray(member.ts), np.asarray(y0), np.asarray(vectors)
+    given = tuple(map(np.asarray, (ts, y0, vectors)))
     return compute_in_doubles(run, *given) if member.is_single else run(*given)
 
 

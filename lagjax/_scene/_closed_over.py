@@ -9,7 +9,6 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -72,7 +71,7 @@ def lift_problem(problem: Problem) -> Problem:
     fields = object.__getattribute__(problem.system, "__dict__")  # an attribute of an equinox.Module takes 2 µs
     present = [f for role in ROLES if isinstance(f := fields[role], Function)]
     if problem.event is not None:
-        present += filter(_is_function, jax.tree.leaves(problem.event.cond_fn, is_leaf=_is_function))
+        present += filter(_is_function, problem.event.functions)
     if not any(object.__getattribute__(f, "code").tracers for f in present):
         return problem
     if jax.tree.leaves((problem.system, present)):  # what holds arrays of its own has no program anyway
@@ -86,8 +85,7 @@ def lift_problem(problem: Problem) -> Problem:
     system = replace_functions(problem.system, functions)
     event = problem.event
     if event is not None:
-        conditions = jax.tree.map(lift, event.cond_fn, is_leaf=_is_function)
-        event = diffrax.Event(conditions, event.root_finder, event.direction)
+        event = event._replace(conditions=jax.tree.map(lift, event.conditions, is_leaf=_is_function))
     return dataclasses.replace(problem, system=system, event=event, params=Lifted(problem.params, tuple(values)))
 
 
@@ -97,7 +95,7 @@ def lift_batch(batch: Batch) -> Batch:
     if member is batch.member:
         return batch
     values = member.params.values
-    return Batch(member, batch.y0, Lifted(batch.params, values), (*batch.axes, *[None] * len(values)))
+    return Batch(member, batch.ts, batch.y0, Lifted(batch.params, values), (*batch.axes, *[None] * len(values)))
 
 
 def _is_function(x: Any) -> bool:

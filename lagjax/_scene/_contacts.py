@@ -69,46 +69,12 @@ class ContactScene(eqx.Module):
     def _motion(self, layout: Layout, params: InContact) -> Motion:
         """The motion while the contacts are as `params` say."""
         free, flat = self.system._motion(layout, params.params), Flat.from_system(self.system, layout, params.params)
+        own = free.constraints
 
         def ask_user(function: Callable | None):
             return function and (lambda *arguments: function(*arguments[:-1], arguments[-1].params))
 
-        def held_positions(q, t, p):
-            own, gaps = free.constraints.f(q, t, p.params), flat.gaps(q, t, p.params)
-            held = p.contacts.closed[: flat.gap_count] * gaps if self.slots is None else self.rows(flat, p)[0] @ gaps
-            return jnp.concatenate([own, held])
-
-        def held_velocities(q, qdot, t, p):
-            one_way, slips = flat.one_way(q, qdot, t, p.params), flat.slips(q, qdot, t, p.params).ravel()
-            held = [p.contacts.closed[flat.gap_count :] * one_way, flat.held_slips(p.contacts) * slips]
-            if self.slots is not None:
-                held = [self.rows(flat, p)[1] @ jnp.concatenate([one_way, slips])]
-            return jnp.concatenate([free.constraints.a(q, qdot, t, p.params), *held])
-
-        def counts(p):
-            q, t = jnp.zeros(layout.size, layout.dtype), jnp.zeros((), layout.dtype)
-            f = jax.eval_shape(free.constraints.f, q, t, p.params).size
-            return f, jax.eval_shape(free.constraints.a, q, q, t, p.params).size
-
-        def held(p):
-            (f, a), closed = counts(p), p.contacts.closed
-            gaps, velocities = jnp.split(jnp.append(closed, flat.held_slips(p.contacts)), [flat.gap_count])
-            if self.slots is not None:
-                gaps, velocities = (rows.sum(axis=1) for rows in self.rows(flat, p))
-            return jnp.concatenate([jnp.ones_like(closed, shape=f), gaps, jnp.ones_like(closed, shape=a), velocities])
-
-        def drag(q, qdot, t, p):
-            (f, _), slides = counts(p), flat.friction(p.params) * (1.0 - p.contacts.sticks)
-            along = flat.slip_direction(q, qdot, t, p)
-            slopes = jax.jacrev(flat.slips, argnums=1)(q, qdot, t, p.params)  # (r, d, n), few rows
-            forces = -slides[:, None] * jnp.einsum("rd,rdn->rn", along, slopes)
-            places = f + flat.rough
-            if self.slots is not None:
-                places, forces = f + np.arange(self.slots[0]), self.rows(flat, p)[0][:, flat.rough] @ forces
-            return jnp.zeros((layout.size, held(p).size), q.dtype).at[:, places].set(forces.T)
-
-        drags = drag if flat.rough.size else None, flat.shapes.directions > 1
-        constraints, own = Constraints(held_positions, held_velocities, held, *drags), free.constraints
+        constraints = self._hold(own, flat, layout)
         if self.is_open:
             constraints = Constraints(ask_user(own.on_positions), ask_user(own.on_velocities))
         lagrangian, forces, dissipation = map(ask_user, (free.lagrangian, free.forces, free.dissipation))
@@ -121,11 +87,46 @@ class ContactScene(eqx.Module):
             *state, p, rows = state_and_multipliers
             if not self.is_open:
                 gaps = flat.gap_count if self.slots is None else self.slots[0]
-                own, normal, _ = self.split_forces(flat, rows, counts(p)[0] + gaps, p)
-                rows = jnp.append(own, normal)
+                others, normal, _ = self.split_forces(flat, rows, _row_counts(own, layout, p)[0] + gaps, p)
+                rows = jnp.append(others, normal)
             return of_user(*state, p.params, rows)
 
         return couple_forces(motion, law, layout, params)
+
+    def _hold(self, own: Constraints, flat: "Flat", layout: Layout) -> Constraints:
+        """The constraints of the system with the rows that hold its contacts behind them, and their friction."""
+
+        def held_positions(q, t, p):
+            gaps = flat.gaps(q, t, p.params)
+            held = p.contacts.closed[: flat.gap_count] * gaps if self.slots is None else self.rows(flat, p)[0] @ gaps
+            return jnp.concatenate([own.f(q, t, p.params), held])
+
+        def held_velocities(q, qdot, t, p):
+            one_way, slips = flat.one_way(q, qdot, t, p.params), flat.slips(q, qdot, t, p.params).ravel()
+            held = [p.contacts.closed[flat.gap_count :] * one_way, flat.held_slips(p.contacts) * slips]
+            if self.slots is not None:
+                held = [self.rows(flat, p)[1] @ jnp.concatenate([one_way, slips])]
+            return jnp.concatenate([own.a(q, qdot, t, p.params), *held])
+
+        def held(p):
+            (f, a), closed = _row_counts(own, layout, p), p.contacts.closed
+            gaps, velocities = jnp.split(jnp.append(closed, flat.held_slips(p.contacts)), [flat.gap_count])
+            if self.slots is not None:
+                gaps, velocities = (rows.sum(axis=1) for rows in self.rows(flat, p))
+            return jnp.concatenate([jnp.ones_like(closed, shape=f), gaps, jnp.ones_like(closed, shape=a), velocities])
+
+        def drag(q, qdot, t, p):
+            (f, _), slides = _row_counts(own, layout, p), flat.friction(p.params) * (1.0 - p.contacts.sticks)
+            along = flat.slip_direction(q, qdot, t, p)
+            slopes = jax.jacrev(flat.slips, argnums=1)(q, qdot, t, p.params)  # (r, d, n), few rows
+            forces = -slides[:, None] * jnp.einsum("rd,rdn->rn", along, slopes)
+            places = f + flat.rough
+            if self.slots is not None:
+                places, forces = f + np.arange(self.slots[0]), self.rows(flat, p)[0][:, flat.rough] @ forces
+            return jnp.zeros((layout.size, held(p).size), q.dtype).at[:, places].set(forces.T)
+
+        drags = drag if flat.rough.size else None, flat.shapes.directions > 1
+        return Constraints(held_positions, held_velocities, held, *drags)
 
     def split_forces(self, flat: "Flat", forces, positions: int, p: InContact) -> tuple:
         """The forces of all rows, `positions` of them on positions: of constraints, normals (k,) and slips (r, d)."""
@@ -146,6 +147,13 @@ class ContactScene(eqx.Module):
             place = np.tri(held.size) @ held
             found.append(jnp.where(place == np.arange(1.0, count + 1)[:, None], held, 0.0))
         return found
+
+
+def _row_counts(own: Constraints, layout: Layout, p: InContact) -> tuple[int, int]:
+    """The counts of a system's own constraints, on positions and on velocities."""
+    q, t = jnp.zeros(layout.size, layout.dtype), jnp.zeros((), layout.dtype)
+    f = jax.eval_shape(own.f, q, t, p.params).size
+    return f, jax.eval_shape(own.a, q, q, t, p.params).size
 
 
 class Flat(NamedTuple):

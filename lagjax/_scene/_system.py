@@ -19,7 +19,17 @@ from jaxtyping import Array, Float
 from lagjax._engine import Problem
 from lagjax._engine.taylor import lowered_motion
 from lagjax._equations import OF_QUANTITIES, Constraints, Motion, Sample, couple_forces, derivation_of
-from lagjax._interface import Function, Layout, ValueNotKnown, accept, as_arrays, is_concrete, present, require_number
+from lagjax._interface import (
+    Function,
+    Layout,
+    ValueNotKnown,
+    accept,
+    as_arrays,
+    is_concrete,
+    present,
+    registered,
+    require_number,
+)
 from lagjax._primitives import SINGLE, compute_in_doubles
 from lagjax._program import Unlowerable, lack_of_memory
 from lagjax._scene._explanation import Explanation, explain
@@ -308,6 +318,75 @@ class System(eqx.Module):
         schur = self._evaluate_quantity(Motion.schur_complement, q, qdot, t, params)
         return facts.with_constraints(names, np.asarray(schur) if is_concrete(schur) else None)
 
+    def equations(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None, *, inputs: PyTree = None) -> Any:
+        """The equations of motion to read, M q̈ = F + Gᵀλ and G q̈ = γ: print them, or show them in a notebook.
+
+        They are `lagjax.results.Equations`, formulas in the names of the leaves of `q` and `params`: q["theta"] is
+        theta, its velocity theta_dot, params["m"] is m, q[0] is q0. All of them hold for every state, time and
+        parameters, of which only the structure is read here; so are `inputs` of functions that ask for them. Of a scene
+        that takes more than 500 operations, or has no scalar program, the result holds a sentence.
+
+        **Raises** the errors of `System` for invalid coordinates and functions.
+
+        ```python
+        import jax.numpy as jnp, lagjax
+
+        def L(q, qdot, params):
+            return 0.5 * params["m"] * params["l"]**2 * qdot**2 + params["m"] * params["g"] * params["l"] * jnp.cos(q)
+
+        equations = lagjax.System(L).equations(0.1, 0.0, params={"m": 1.0, "l": 0.5, "g": 9.81})
+        print(equations)
+        equations.force  # {"q": "-m*g*l*sin(q)"}
+        ```
+        """
+        require_number(t, "t")
+        self, layout = present_system(self), Layout.from_state(q, qdot)
+        return registered().write_equations(self, layout, params, inputs)
+
+    def to_c(
+        self,
+        q: PyTree,
+        qdot: PyTree,
+        t: Time = 0.0,
+        params: PyTree = None,
+        *,
+        inputs: PyTree = None,
+        name: str = "scene",
+        dtype: Literal["float64", "float32"] = "float64",
+    ) -> str:
+        """The equations of motion as C99, which needs `math.h` and nothing else: to run where there is no Python.
+
+        The text has the functions
+
+            {name}_acceleration(q, qdot, t, params, inputs, qddot)      n numbers; NaN where M is singular
+            {name}_mass_matrix(q, qdot, t, params, inputs, M)           n rows of n
+            {name}_energy(q, qdot, t, params, inputs, h)                one number
+            {name}_step(q, qdot, t, params, inputs, dt, steps)          steps of the classical Runge–Kutta method
+            {name}_project(q, qdot, t, params, inputs, state)           one Newton step back to constraints, if any
+
+        of arrays of `dtype`, whose order a comment names; `params` and `inputs` are left out where a scene has none.
+        Only the structure of the arguments is read here: one text serves all values. Compiled with `-ffp-contract=off`
+        and without `-ffast-math`, accelerations have the bits of `jax.jit(system.acceleration)`; sine and cosine are
+        written out, other functions are those of `math.h`. In float32 everything is computed in float32.
+
+        A step takes four accelerations, of global order 4, and ends with a projection where there are constraints.
+        Steps of fixed length do not end where accelerations jump or have corners, as dry friction does: such a scene
+        has no `{name}_step`, and a comment says so.
+
+        **Raises** `TypeError` for a scene with contacts, `ValueError` for one without a scalar program, and for a name
+        that is no identifier.
+
+        ```python
+        import jax.numpy as jnp, lagjax
+
+        pendulum = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 + params["g"] * jnp.cos(q))
+        text = pendulum.to_c(0.1, 0.0, params={"g": 9.81}, name="pendulum")
+        ```
+        """
+        require_number(t, "t")
+        self, layout = present_system(self), Layout.from_state(q, qdot)
+        return registered().write_c(self, layout, params, inputs, name, dtype)
+
     def _motion(self, layout: Layout, params: PyTree = None) -> Motion:
         """The scene in the flat coordinates of `layout`, after a look at what its functions return there."""
         # The functions of the result take the numbers in `params` alone, with None in the place of everything else.
@@ -485,7 +564,7 @@ class System(eqx.Module):
         if not self.reads_multipliers:
             return {}
         trees = self._role_shapes(self._multiplier_roles, layout, params)
-        flat = jnp.zeros(count_numbers(trees), layout.dtype)
+        flat = np.zeros(count_numbers(trees), layout.dtype)
         return {"multipliers": jax.eval_shape(lambda x: name_numbers(x, trees), flat)}
 
 
@@ -599,7 +678,7 @@ def _evaluate(system: System, quantity: Callable, q, qdot, t, params, **more):
     layout = Layout.from_state(q, qdot)
     numbers, derivation = eqx.filter(params, eqx.is_array), derivation_of(system, layout, params)
     motion = derivation.motion if system.path == "array" else lowered_motion(derivation)
-    return quantity(motion, layout.flatten(q), layout.flatten(qdot), t, numbers, **more)
+    return getattr(motion, quantity.__name__)(layout.flatten(q), layout.flatten(qdot), t, numbers, **more)
 
 
 def _require_scalar(value: PyTree, role: str) -> None:

@@ -4,11 +4,23 @@ _summary     the three lines of a trajectory
 _notebook    the HTML of a result: its text, and a small picture
 _course      a motion between its outputs
 _animation   a motion as a film
+_c_source    the equations of a scene in C
+_equations_text   the equations of a scene to read, in formulas of _formula_text
 _export      a trajectory as an xarray.Dataset or a pandas.DataFrame
 """
 
 from lagjax._show._animation import Animation, make_animation, require_points
-from lagjax._show._course import course_of, courses_of, join_curve
-from lagjax._show._export import change_frame, columns_of, dataset, frame, impact_frame
-from lagjax._show._notebook import COLORS, cell, even_places, render_picture, simplify_axes, trajectory_html
+from lagjax._show._c_source import write_c
+from lagjax._show._course import course_of, courses_of, join_curve, spans_of, wrap_curve
+from lagjax._show._equations_text import Equations, write_equations
+from lagjax._show._export import change_frame, columns_of, dataset, frame, impact_frame, spread_prefix
+from lagjax._show._notebook import (
+    COLORS,
+    cell,
+    draw_curves,
+    even_places,
+    render_picture,
+    simplify_axes,
+    trajectory_html,
+)
 from lagjax._show._summary import canonical_summary, import_package, require_numbers, summary

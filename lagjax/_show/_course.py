@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from lagjax._interface import RESULTS, Layout, numbers_at
-from lagjax._run import Members
+from lagjax._run import CHANGE_WORDS, Members
 
 # Points of a curve, at least: four times as many as dots of a figure that is printed, because a planet passes its
 # perihelion in a fraction of them. Half as many show corners there.
@@ -61,6 +61,50 @@ def join_curve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     xy = np.stack([x, y])
     gaps = 1 + np.flatnonzero(np.isnan(y[1:-1]))
     return np.delete(xy, gaps[(xy[:, gaps - 1] == xy[:, gaps + 1]).all(axis=0)], axis=1)
+
+
+def wrap_curve(x: np.ndarray, y: np.ndarray, of_x: float | None, of_y: float | None = None) -> tuple:
+    """A curve with x and y in −P/2 … P/2 for a period P each, None without one: it leaves at an edge, and comes in at
+    the other after a gap."""
+    if of_x is not None:
+        x, y = _wrap_one(x, y, of_x)
+    return (x, y) if of_y is None else _wrap_one(y, x, of_y)[::-1]
+
+
+def _wrap_one(angle: np.ndarray, other: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
+    turns = np.floor(angle / period + 0.5)
+    steps = np.nan_to_num(np.diff(turns))
+    left = np.flatnonzero(steps)
+    edge = period * (np.maximum(turns[left], turns[left + 1]) - 0.5)
+    at = other[left] + (edge - angle[left]) / (angle[left + 1] - angle[left]) * (other[left + 1] - other[left])
+    side, gap = period / 2 * np.sign(steps[left]), np.full(len(left), np.nan)
+    places = np.repeat(left + 1, 3)
+    wrapped = np.insert(angle - period * turns, places, np.stack([side, gap, -side], axis=1).ravel())
+    return wrapped, np.insert(other, places, np.stack([at, gap, at], axis=1).ravel())
+
+
+def spans_of(trajectory) -> dict[str, list[tuple[float, float]]]:
+    """The times of one motion in each of its modes, or with each contact closed: pairs (from, to), by name."""
+    names = trajectory.mode_names or trajectory.contact_names
+    begin, end = (float(np.ravel(x)[0]) for x in (trajectory.ts, trajectory.end.t))
+    since, spans = {}, {name: [] for name in names}
+    if not names:
+        return spans
+    if (changes := trajectory.transitions) is not None:
+        t, left, entered = (np.ravel(x) for x in (changes.t, changes.source, changes.target))
+        since[next((mode for mode in left if mode >= 0), np.ravel(trajectory.mode)[0])] = begin
+    else:
+        changes = trajectory.contact_changes
+        t, contact, words = np.ravel(changes.t), np.ravel(changes.contact), np.array(CHANGE_WORDS)[changes.change]
+        left, entered = (np.where(np.ravel(words) == word, contact, -1) for word in ("opens", "closes"))
+    for when, one, other in zip(t, left, entered, strict=True):
+        if one != other and one in since:
+            spans[names[one]].append((since.pop(one), float(when)))
+        if one != other and other >= 0:
+            since.setdefault(other, float(when))
+    for k, first in since.items():
+        spans[names[k]].append((first, end))
+    return {name: [(first, last) for first, last in found if first != last] for name, found in spans.items()}
 
 
 def courses_of(trajectory, places) -> tuple[Layout, list[Course]]:

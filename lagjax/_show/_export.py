@@ -121,17 +121,25 @@ def _units(tree: PyTree, units: PyTree, time_unit: str | None) -> tuple[list, li
     """The unit of every leaf of q, and of its velocity; None where there is none."""
     if time_unit is not None and not isinstance(time_unit, str):
         raise TypeError(f"time_unit must be text, as 's' is; got {time_unit!r}.")
-    try:
-        whole = jax.tree.broadcast(units, tree, is_leaf=lambda unit: unit is None or isinstance(unit, str))
-    except ValueError:
-        paths = ["q" + jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(tree)][:8]
-        raise ValueError(
-            f"units is {units!r}, which does not fit the structure of q: give text for all coordinates, or a pytree "
-            f"like q with text or None for each ({', '.join(paths)})."
-        ) from None
-    of_q = jax.tree.leaves(whole, is_leaf=lambda unit: unit is None)
+    of_q = spread_prefix(units, tree, "units", "text")
     if wrong := [unit for unit in of_q if not (unit is None or isinstance(unit, str))]:
         raise TypeError(f"A unit must be text, as 'rad' is, or None; got {wrong[0]!r}.")
     per_time = "" if time_unit is None else time_unit
     of_qdot = [f"{unit or 1}/{per_time}" if unit is not None and per_time else None for unit in of_q]
     return of_q, of_qdot
+
+
+def spread_prefix(prefix: PyTree, tree: PyTree, name: str, what: str) -> list:
+    """The values of a pytree prefix for all leaves of q, None without. Raises `ValueError` where it does not fit."""
+
+    def is_value(x) -> bool:
+        return x is None or isinstance(x, str)
+
+    try:
+        return jax.tree.leaves(jax.tree.broadcast(prefix, tree, is_leaf=is_value), is_leaf=is_value)
+    except ValueError:
+        paths = ["q" + jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(tree)][:8]
+        raise ValueError(
+            f"{name} is {prefix!r}, which does not fit the structure of q: give {what} for all coordinates, or a "
+            f"pytree like q with {what} or None for each ({', '.join(paths)})."
+        ) from None

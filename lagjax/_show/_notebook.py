@@ -56,12 +56,9 @@ def _draw(figure, trajectory) -> None:
     codes = np.asarray(trajectory.result._value).ravel()
     members, ax = even_places(codes.size, MEMBERS), figure.subplots()
     layout, courses = courses_of(trajectory, members)
-    opacity = max(0.15, len(members) ** -0.5)
     curves = [_shorten(course) for course in courses]
     for name, color, i in zip(layout.names, COLORS, range(COORDINATES), strict=False):
-        for t, q in curves:
-            ax.plot(*join_curve(t, q[:, i]), color=color, alpha=opacity, linewidth=1.2)
-        ax.lines[-len(curves)].set_label(name)
+        draw_curves(ax, [join_curve(t, q[:, i]) for t, q in curves], color, name)
     if layout.size > COORDINATES:
         ax.plot([], [], " ", label=f"… ({layout.size - COORDINATES} more)")
     for member in members[~np.isin(codes[members], ENDED_WELL)]:
@@ -71,6 +68,13 @@ def _draw(figure, trajectory) -> None:
     legend = ax.legend(frameon=False, fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
     for handle in legend.legend_handles:
         handle.set_alpha(1.0)
+
+
+def draw_curves(ax, curves: list, color: str, label: str | None = None, width: float = 1.2) -> None:
+    """Curves (2, F) of some members in one colour, of which the first has the label."""
+    for k, curve in enumerate(curves):
+        style = dict(color=color, alpha=max(0.15, len(curves) ** -0.5), linewidth=width)
+        ax.plot(*curve, label=None if k else label, **style)
 
 
 def _shorten(course: Course) -> tuple[np.ndarray, np.ndarray]:

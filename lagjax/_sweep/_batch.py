@@ -79,6 +79,7 @@ class Batches:
         self._axes = tuple(0 if start else None for start in self._starts.values())
         self._keep_all, self._keep_one = jax.jit(self._keep_vectorized), jax.jit(self._keep_member)
         self._drift_all, self._tolerances = jax.jit(jax.vmap(self._drift_of, in_axes=(0, self._axes[2]))), None
+        self._settings = None
 
     def __call__(self, points: dict[str, np.ndarray]) -> KeptResults:
         """The kept values of the members at these points (B,)."""
@@ -105,7 +106,7 @@ class Batches:
         starts = self._starts.items()
         values = {role: f(points, complaints) if f else getattr(description, role) for role, f in starts}
         run, crossings = run_batch(description, values, ts, self._axes)
-        self._tolerances = None if jumps(description.system) else run.tolerances
+        self._tolerances, self._settings = None if jumps(description.system) else run.tolerances, run.settings
         for_members = values["params"] if self._axes[2] == 0 else None
         return _BatchMotions(run, (_arrays(run), crossings), for_members), complaints
 
@@ -157,8 +158,9 @@ class Batches:
         scene, code = self.description.system, arrays["code"]
         modes = dict(scene.modes) if isinstance(scene, Hybrid) else None
         return Trajectory.from_fields(
-            **{name: x for name, x in arrays.items() if name != "code"}, result=result_from(code), engine="",
-            ts=jnp.asarray(self.description.ts), tolerances=self._tolerances, system=modes or scene, params_axes=None,
+            **{name: x for name, x in arrays.items() if name != "code"}, result=result_from(code),
+            settings=self._settings, tolerances=self._tolerances, ts=jnp.asarray(self.description.ts),
+            system=modes or scene,
             params=self.description.params if self._axes[2] is None else params, mode_names=tuple(modes or ()),
             contact_names=(),
         )  # fmt: skip
@@ -358,8 +360,8 @@ def _follow_crossings(batch: Batch, sections: Sections) -> tuple[Solution, Noted
     surfaces = surfaces_in(batch.member, sections_of(section)[1], sections.directions, sections.names)
     problem = dataclasses.replace(batch.member, guards=surfaces.guards(notes=True))
     tolerances = tolerances_of(problem)._replace(notes=sections.count)
-    ts, y0, params = (np.asarray(x) for x in (problem.ts, batch.y0, batch.vectors))
-    solution = flow_of(problem).run(ts[None], y0, params, tolerances)
+    ts, y0, params = (np.asarray(x) for x in (batch.ts, batch.y0, batch.vectors))
+    solution = flow_of(problem).run(ts, y0, params, tolerances)
     path = solution.path.reshape(len(y0), len(sections.functions), sections.count + 1, -1)
     rows = np.moveaxis(path, 1, 0)
     return solution, Noted(rows[:, :, :-1, 0], rows[:, :, :-1, 1:], rows[:, :, -1, 0])

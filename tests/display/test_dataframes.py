@@ -155,6 +155,8 @@ def test_a_picture_marks_impacts(struck):
     plot = pytest.importorskip("matplotlib") and lagjax.plot
     for run in struck:
         ax = plot.trajectory(run)
-        assert [text.get_text() for text in ax.get_legend().get_texts()] == ["q[0]", "q[1]", "impact['floor']"]
+        closed = ["contacts['floor']"] * (run.ok.size == 1)  # the times at which it is, of one motion
+        texts = [text.get_text() for text in ax.get_legend().get_texts()]
+        assert texts == ["q[0]", "q[1]", *closed, "impact['floor']"]
         assert len(ax.lines[-1].get_xdata()) == np.sum(run.impacts.count)
     assert len(plot.trajectory(struck[0], lambda q: (q[0], q[1])).lines) == 1

@@ -310,6 +310,120 @@ def test_modes_tell_what_grows_and_are_drawn_at_their_largest():
     assert lagjax.plot.modes(lagjax.normal_modes(rubbing, 0.0))[0].get_title() == "ω = 0.995, ζ = 0.1"
 
 
+def test_a_bifurcation_diagram_of_a_driven_spring():
+    def lagrangian(q, v, params, t):
+        return 0.5 * v**2 - 0.5 * q**2 + params["A"] * q * jnp.cos(params["w"] * t)
+
+    spring = lagjax.System(lagrangian, dissipation=lambda q, v: 0.25 * v**2)
+    drives, rates = np.linspace(0.0, 2.0, 5), np.linspace(0.5, 2.0, 4)
+
+    def seen(A, w):  # of A cos wt, once in a period
+        return A * (1 - w**2) / ((1 - w**2) ** 2 + (0.5 * w) ** 2)
+
+    start = dict(q0=1.0, params={"A": 0.0, "w": 2.0}, transient=20, points=3)
+    ax = lagjax.plot.bifurcation(spring, {"A": drives}, np.pi, **start)
+    x, y = ax.collections[0].get_offsets().T
+    np.testing.assert_array_equal(x, np.repeat(drives, 3))
+    np.testing.assert_allclose(y, seen(x, 2.0), atol=2e-7)  # exp(-0.25 * 21π) of the start is left
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("A", "q")
+    start["params"] = lambda point: {"A": 2.0, "w": point["w"]}
+    ax = lagjax.plot.bifurcation(
+        spring,
+        {"w": rates},
+        lambda point: 2 * jnp.pi / point["w"],
+        **start,
+        value=lambda q, v: 10 * q,
+        period=2 * np.pi,
+    )
+    x, y = ax.collections[0].get_offsets().T
+    exact = 10 * seen(2.0, x)
+    np.testing.assert_allclose(y, exact - 2 * np.pi * np.round(exact / (2 * np.pi)), atol=2e-5)
+
+
+def test_points_that_are_known_make_a_bifurcation_diagram():
+    drives, points = np.arange(3.0), np.array([[1.0, 2.0], [np.nan, 4.0], [5.0, 6.0]])
+    ax = lagjax.plot.bifurcation(drives, points)
+    np.testing.assert_array_equal(ax.collections[0].get_offsets(), [[0, 1], [0, 2], [1, 4], [2, 5], [2, 6]])
+    assert len(lagjax.plot.bifurcation(drives, points[:, 0], ax=ax).collections) == 2
+    first, second = (points.get_facecolor()[0] for points in ax.collections)
+    assert (first != second).any()
+    with pytest.raises(ValueError, match="No member has a finite point"):
+        lagjax.plot.bifurcation(drives, np.nan * points)
+
+
+@pytest.fixture(scope="module")
+def rotor():
+    """An angle that turns by −3 a second from 1, and a place that does not."""
+    free = lagjax.System(lambda q, v: 0.5 * v["a"] ** 2 + 0.5 * v["x"] ** 2)
+    return lagjax.simulate(free, {"a": 1.0, "x": 0.0}, {"a": -3.0, "x": 2.0}, TS)
+
+
+def test_angles_leave_at_one_edge_and_come_in_at_the_other(rotor):
+    ax = lagjax.plot.trajectory(rotor, period={"a": 2 * np.pi, "x": None})
+    t, angle = ax.lines[0].get_data()
+    known = np.isfinite(angle)
+    assert np.abs(angle[known]).max() == np.pi and _smooth(np.stack([t, angle], axis=1), 0.02)
+    turns = (angle[known] - (1.0 - 3.0 * t[known])) / (2 * np.pi)
+    np.testing.assert_allclose(turns, np.round(turns), atol=1e-9)
+    gaps = np.flatnonzero(~known)
+    exact = (1 + np.pi * np.array([1, 3, 5])) / 3  # where 1 − 3t is an odd multiple of −π
+    np.testing.assert_allclose(t[gaps - 1], exact[exact < 5], atol=1e-9)
+    np.testing.assert_array_equal([angle[gaps - 1], angle[gaps + 1]], [[-np.pi] * len(gaps), [np.pi] * len(gaps)])
+    np.testing.assert_allclose(ax.lines[1].get_ydata(), 2 * ax.lines[1].get_xdata(), atol=1e-9)
+    for ax in (
+        lagjax.plot.phase(rotor, "q['a']", period=2 * np.pi),
+        lagjax.plot.trajectory(rotor, lambda q, v: (q["a"], v["a"]), period=2 * np.pi),
+    ):
+        assert np.nanmax(np.abs(ax.lines[0].get_xdata())) == np.pi
+        assert np.isnan(ax.lines[0].get_xdata()).sum() == len(gaps)
+        assert [label.get_text() for label in ax.get_xticklabels()] == ["−π", "−π/2", "0", "π/2", "π"]
+    ax = lagjax.plot.trajectory(rotor, lambda q, v: (q["x"], q["a"]), period=(None, 90.0))
+    np.testing.assert_array_equal(ax.get_yticks(), [-45.0, -22.5, 0.0, 22.5, 45.0])
+
+
+def test_modes_and_closed_contacts_are_shaded():
+    lifted = lagjax.System(
+        lambda q, v: 0.5 * v @ v - q[0] - q[1],
+        forces=lambda q, v, t: jnp.stack([t, 0.0 * t]),
+        contacts=lambda q: {"floor": q[0], "lid": 5.0 - q[0], "step": q[1]},
+    )
+    run = lagjax.simulate(lifted, np.array([0.0, 0.5]), np.zeros(2), np.linspace(0.0, 2.0, 11))
+    ax = lagjax.plot.trajectory(run)  # the force is as large as the weight at t = 1, when the other has fallen by 1/2
+    spans = {span.get_label(): span.get_bbox().extents for span in ax.patches}
+    assert list(spans) == ["contacts['floor']", "contacts['step']"]
+    np.testing.assert_allclose(spans["contacts['floor']"], [0.0, 0.0, 1.0, 0.04], atol=1e-9)
+    np.testing.assert_allclose(spans["contacts['step']"], [1.0, 0.08, 2.0, 0.12], atol=1e-9)
+    (mark,) = [line for line in ax.lines if line.get_label() == "impact['step']"]
+    np.testing.assert_allclose(mark.get_xydata(), [[1.0, 0.1]], atol=1e-9)
+
+
+def test_modes_are_shaded():
+    modes = {"slow": OSCILLATOR, "fast": lagjax.System(lambda q, v: 0.5 * v**2 - 2 * q**2)}
+    there, back = (lagjax.Transition(*names, lambda q, v: q, 0) for names in (("slow", "fast"), ("fast", "slow")))
+    run = lagjax.simulate(lagjax.Hybrid(modes, [there, back], "slow"), 1.0, 0.0, np.linspace(0.0, 4.0, 9))
+    ax = lagjax.plot.trajectory(run)
+    spans = [(span.get_label(), *span.get_bbox().intervalx) for span in ax.patches]
+    quarters = np.pi * np.array([0.0, 0.5, 1.0])  # a quarter of a slow period, half a fast one
+    assert [name for name, *_ in spans] == ["slow", "_", "fast"]
+    np.testing.assert_allclose([first for _, first, _ in spans], quarters[[0, 2, 1]], atol=1e-9)
+    np.testing.assert_allclose([last for *_, last in spans], [*quarters[[1]], 4.0, quarters[2]], atol=1e-9)
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["q", "slow", "fast"]
+
+
+def test_rows_of_a_lattice(rotor):
+    chain = lagjax.System(lambda q, v: 0.5 * jnp.sum(v["u"] ** 2) + 0.5 * v["x"] ** 2)
+    start = {"u": np.zeros(9), "x": 0.0}, {"u": np.arange(9.0), "x": 1.0}
+    run = lagjax.simulate(chain, *start, TS)
+    ax = lagjax.plot.space_time(run, "qdot['u']")
+    np.testing.assert_array_equal(ax.collections[0].get_array().reshape(9, len(TS)), run.qdot["u"].T)
+    ax = lagjax.plot.space_time(run, "q['u']", period=2 * np.pi)
+    shown, turns = ax.collections[0].get_array().reshape(9, len(TS)), run.q["u"].T / (2 * np.pi)
+    np.testing.assert_allclose(shown, 2 * np.pi * (turns - np.floor(turns + 0.5)), atol=1e-12)
+    assert ax.collections[0].get_clim() == (-np.pi, np.pi)
+    with pytest.raises(ValueError, match=r"no row \"q\['w'\]\"; there are q\['u'\], q\['x'\], and their velocities"):
+        lagjax.plot.space_time(run, "q['w']")
+
+
 @pytest.mark.parametrize(
     ("draw", "said"),
     [
@@ -319,6 +433,13 @@ def test_modes_tell_what_grows_and_are_drawn_at_their_largest():
         (lambda run: lagjax.plot.trajectory(run, lambda q, v: q[0]), "two numbers, .* for one state; got shapes"),
         (lambda run: lagjax.plot.energy_error(None), "got NoneType"),
         (lambda run: lagjax.plot.modes(run), "modes must be what lagjax.normal_modes returns; got Trajectory"),
+        (lambda run: lagjax.plot.phase(run, period=0.0), "period must be a positive number, 2π for an angle; got 0.0"),
+        (lambda run: lagjax.plot.phase(run, period={"a": 1.0}), "period is .*, which does not fit the structure of q"),
+        (lambda run: lagjax.plot.bifurcation(OSCILLATORS, np.ones(3)), "over must be a dict"),
+        (lambda run: lagjax.plot.bifurcation(OSCILLATORS, {"A": [1.0]}), "strobe is the period of the drive"),
+        (lambda run: lagjax.plot.bifurcation(OSCILLATORS, {"A": [1.0]}, 1.0), "Nothing depends on A: give params as"),
+        (lambda run: lagjax.plot.bifurcation(OSCILLATORS, {"A": [1.0], "B": [1.0]}, 1.0), "over must have one axis"),
+        (lambda run: lagjax.plot.bifurcation(run.ts, run.q[:-1]), r"got \(40, 2\) and \(41,\)"),
         (lambda run: lagjax.plot.fit(run), "fit must be what lagjax.fit returns"),
         (lambda run: lagjax.plot.work_precision(run), "result must be what lagjax.work_precision returns"),
         (lambda run: lagjax.plot.state_map(np.zeros(1), np.zeros(3), np.zeros((3, 1))), "two columns and two rows"),

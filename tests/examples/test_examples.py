@@ -1,6 +1,7 @@
 """The examples run, write their pictures, and find what they claim to find."""
 
 import importlib
+import shutil
 from pathlib import Path
 
 import matplotlib
@@ -61,6 +62,14 @@ def test_tour(tmp_path, monkeypatch, capsys):
     assert tour.main(tmp_path) == [tmp_path / "a.png", tmp_path / "b.png"]
     assert all(argv[:2] == ["--out", str(tmp_path)] for argv in calls) and len(calls) == 2
     assert str(tmp_path) in capsys.readouterr().out
+
+
+def test_equations_are_printed_and_run_in_c(capsys):
+    importlib.import_module("equations")
+    printed = capsys.readouterr().out
+    assert "M[q0, q1] = m2*l1*l2*cos(q0 - q1)" in printed
+    if shutil.which("cc"):
+        assert float(printed.split()[-1]) < 1e-9  # the step is 1 ms, of order 4
 
 
 TOSSES = Path(__file__).parents[3] / "shared" / "data" / "cube_tosses_identification.npz"

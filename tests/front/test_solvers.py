@@ -86,3 +86,13 @@ def test_only_what_they_are_for():
             lagjax.FineOutput(wrong)
     with pytest.raises(TypeError, match="FSAL"):
         lagjax.FineOutput(diffrax.Heun())
+
+
+def test_results_have_the_numbers_of_diffrax():
+    # The codes of stores that were written before stay what they were, and those of other versions go by their names.
+    names = list(diffrax.RESULTS._name_to_item)
+    assert names == list(lagjax.RESULTS._name_to_item)[: len(names)]
+    for name in names:
+        assert getattr(lagjax.RESULTS, name)._value == getattr(diffrax.RESULTS, name)._value
+    with pytest.raises(ValueError, match="same type"):
+        lagjax.RESULTS.successful == diffrax.RESULTS.successful  # noqa: B015

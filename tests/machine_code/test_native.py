@@ -691,7 +691,7 @@ def test_a_member_alone_is_bit_for_bit_the_member_of_a_batch(make):
     order, cotangents = _kernel.order_for(1e-9), (np.ones_like(together.path), np.ones_like(together.y_end))
     back = [
         kernel.select_width(len(run.steps)).vjp(
-            ts, numbers, _native.StepRecord(run.table, run.steps.cumsum() - run.steps, run.steps, order),
+            ts, numbers, _native.Steps(run.table, run.steps.cumsum() - run.steps, run.steps, order),
             *(c[: len(run.steps)] for c in cotangents),
         )
         for run in runs

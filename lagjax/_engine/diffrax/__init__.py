@@ -25,7 +25,6 @@ from lagjax._engine._problem import (
     Solution,
     evaluate_condition,
     flat_condition,
-    has_own_root_finder,
     signs_of_event,
     solve_in_doubles,
     too_tight,
@@ -34,7 +33,7 @@ from lagjax._engine._stop_reason import End, what_stopped
 from lagjax._engine.diffrax._equations import MotionEquations, equations_of
 from lagjax._engine.diffrax._integrate import Converted, Jumps, Method, WithJumps, integrate
 from lagjax._engine.diffrax._jumps import freeze
-from lagjax._engine.diffrax._solvers import FineOutput, Projected
+from lagjax._engine.diffrax._solvers import FineOutput
 from lagjax._equations import forms
 from lagjax._interface import (
     ENDED_WELL,
@@ -125,6 +124,14 @@ class Diffrax(AbstractEngine, eqx.Module):
             return None
         return f"dt={self.dt} needs {needed:.0f} steps, more than max_steps={problem.max_steps}: raise one of them"
 
+    @property
+    def is_implicit(self) -> bool:
+        return isinstance(self.solver, diffrax.AbstractImplicitSolver)
+
+    def tolerances(self, problem: Problem, y0) -> tuple | None:
+        """rtol and atol of a step; None where it has a fixed size."""
+        return None if self.dt is not None else super().tolerances(problem, y0)
+
     def lacks_memory(self, problem: Problem, members: int = 1) -> str | None:
         """The memory that a large scene, or `members` like it, takes, as the end of a sentence; None where it is there.
 
@@ -164,13 +171,12 @@ class Diffrax(AbstractEngine, eqx.Module):
             # States between steps are wanted for outputs inside and to locate an event.
             between = ts.size > 2 or problem.event is not None
             solver = FineOutput(diffrax.Dopri8()) if between else diffrax.Dopri8()
-        if self.dt is not None:
+        if (tolerances := self.tolerances(problem, problem.y0)) is None:
             dt0 = jnp.asarray(self.dt, dtype) * jnp.sign(ts[-1] - ts[0])
             return Method(solver, diffrax.ConstantStepSize(), dt0, problem.max_steps, self.progress)
-        rtol, atol = self.tolerances(problem, problem.y0)
         # Below this a step no longer moves the time reliably.
         smallest = 4 * jnp.finfo(dtype).eps * jnp.maximum(abs(ts[0]), abs(ts[-1]))
-        controller = diffrax.PIDController(rtol, atol, norm=_norm_or_inf, dtmin=smallest, force_dtmin=False)
+        controller = diffrax.PIDController(*tolerances, norm=_norm_or_inf, dtmin=smallest, force_dtmin=False)
         if (jumps := _jumps(problem)) is not None:
             controller = WithJumps(controller, jumps)
         return Method(solver, controller, None, problem.max_steps, self.progress, jumps)
@@ -230,7 +236,7 @@ def _solve(engine: Diffrax, problem: Problem) -> Solution:
         lost = derivation.motion.rank_lost((*halves(y0), given[0], numbers), (*end, solution.t_end, numbers))
         failed = (result != RESULTS.successful) & (result != RESULTS.event_occurred)
         result = RESULTS.where(failed & lost, RESULTS.constraint_rank_lost, result)
-        not_projected = solution.result == code_of(RESULTS.promote(Projected.FAILED))
+        not_projected = solution.result == code_of(RESULTS.breakdown)
         result = RESULTS.where(not_projected, RESULTS.projection_failed, result)
     # diffrax leaves outputs it did not reach at inf, and those of a member without time at its start. Whatever adjoint
     # there is, their cotangents must not be lost: they go to all that went in.
@@ -302,20 +308,38 @@ def _flatten_event(problem: Problem, ts, y0, numbers) -> tuple[diffrax.Event, bo
 
         return condition
 
-    functions = jax.tree.leaves(event.cond_fn, is_leaf=callable)
-    ways = jax.tree.leaves(event.direction, is_leaf=lambda leaf: leaf is None)
-    conditions = [flat(function, sign) for function, sign in zip(functions, signs, strict=True)]
-    ways = [sign > 0 if sign else way for sign, way in zip(signs, ways, strict=True)]
+    conditions = [flat(function, sign) for function, sign in zip(event.functions, signs, strict=True)]
+    ways = [sign > 0 if sign else way for sign, way in zip(signs, event.ways, strict=True)]
     if len(conditions) == 1:
-        return diffrax.Event(conditions[0], event.root_finder, ways[0]), None not in signs
-    if not has_own_root_finder(event):
+        tolerance = 4 * float(jnp.finfo(ts.dtype).eps)
+        finder = event.root_finder or _SignChange(rtol=tolerance, atol=tolerance)
+        return diffrax.Event(conditions[0], finder, ways[0]), None not in signs
+    if event.root_finder is None:
         raise ValueError(
-            f"An event of {len(functions)} functions is for machine code: of several that a step of diffrax passes, "
+            f"An event of {len(conditions)} functions is for machine code: of several that a step of diffrax passes, "
             "the first of the list would end the motion, and not the first in time. Leave the solver out, or make one "
             "function of them that changes sign where any of them does, as lambda q, qdot: jnp.minimum(f, g) of two "
             "that are positive before."
         )
     return diffrax.Event(conditions, event.root_finder, ways), None not in signs
+
+
+class _SignChange(optx.Bisection):
+    """Bisection that stops when the interval is as small as the dtype resolves, whatever the size of the function.
+
+    The sign change that fired an event brackets its root, so that this always arrives. It also does where there is
+    nothing to find, as in members of a batch that had no event, or in a Boolean one: diffrax asks for the step's end.
+    """
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        lower, upper = (jnp.asarray(options[end], f_struct.dtype) for end in ("lower", "upper"))
+        state = optx.Bisection(self.rtol, self.atol, flip=True).init(fn, y, args, options, f_struct, aux_struct, tags)
+        return eqx.tree_at(lambda s: s.flip, state, fn(lower, args)[0] > fn(upper, args)[0])
+
+    def terminate(self, fn, y, args, options, state, tags):
+        scale = jnp.maximum(jnp.abs(state.lower), jnp.abs(state.upper))
+        small = jnp.abs(state.upper - state.lower) <= self.rtol * scale
+        return small & jnp.isfinite(state.error), optx.RESULTS.successful
 
 
 # ---- what can be wrong with a solver ---------------------------------------------------------------------------------

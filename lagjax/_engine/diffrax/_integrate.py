@@ -141,13 +141,19 @@ def _call(moving, method: Method, adjoint, event=None, *more: diffrax.SubSaveAt)
         progress_meter=method.progress,
     )
     accepted, rejected = (done.stats[f"num_{kind}_steps"] for kind in ("accepted", "rejected"))
-    result = RESULTS.promote(done.result)._value
+    result = jnp.asarray(_CODES)[done.result._value]
     crossed = done.controller_state[1] if notes else jnp.array(False)
     path, y_end, t_end = done.ys[0], done.ys[1][0], done.ts[1][0]
     if len(ts) == 2:  # infinite where it was not reached, as the others are
         path = jnp.stack([path[0], jnp.where(t_end == ts[-1], path[1], jnp.inf)])
     ended = None if event is None else jnp.stack(jax.tree.leaves(done.event_mask))
     return Solution(path, y_end, t_end, result, accepted, rejected, ended), done.ys[2:], crossed
+
+
+# The code of each of diffrax's results. One that another version of diffrax adds has no name of ours.
+_CODES = np.array([
+    code_of(getattr(RESULTS, name, RESULTS.internal_error)) for name in diffrax.RESULTS._name_to_item
+], np.int32)  # fmt: skip
 
 
 def _set_stage_loop(solver, adjoint):

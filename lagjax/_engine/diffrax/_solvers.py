@@ -156,16 +156,13 @@ class Projected(_Around):
     """The steps of a solver, each followed by a projection of the state (2n,): `project(t, y, args)`, a Newton step.
 
     Two Newton steps are taken, the second of which says whether the method converges. Where it does not, the state is
-    NaN, so that the step is rejected; where no step can be rejected (fixed steps), the run ends with
-    `Projected.FAILED`. The distance between the solver's state and the projected one is added to the error of the step:
+    NaN, so that the step is rejected; where no step can be rejected (fixed steps), the run ends with `breakdown`. The
+    distance between the solver's state and the projected one is added to the error of the step:
     a constraint that jumps is then refused and not followed. The states inside a step are those of the solver.
     """
 
     solver: diffrax.AbstractSolver
     project: Callable
-
-    # The only code of diffrax that none of its own solvers returns.
-    FAILED: ClassVar[Any] = diffrax.RESULTS.breakdown
 
     @property
     def term_structure(self):
@@ -190,7 +187,8 @@ class Projected(_Around):
         arrays, others = eqx.partition((nearer, error, dense), eqx.is_inexact_array)
         lost = jax.tree.map(lambda leaf: jnp.where(failed, jnp.nan, leaf), arrays)
         y1, error, dense = eqx.combine(lost, others)
-        projection = diffrax.RESULTS.where(failed, self.FAILED, diffrax.RESULTS.successful)
+        # `breakdown` is the only code of diffrax that none of its own solvers returns.
+        projection = diffrax.RESULTS.where(failed, diffrax.RESULTS.breakdown, diffrax.RESULTS.successful)
         return y1, error, dense, state, diffrax.RESULTS.where(result == diffrax.RESULTS.successful, projection, result)
 
 

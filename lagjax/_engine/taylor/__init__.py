@@ -173,7 +173,7 @@ class MachineCode(AbstractEngine):
             problem = member.double_precision if member.is_single else member
             return _name_events(problem, flow_of(problem).run(ts, y0, params, tolerances_of(problem)))
 
-        given = np.asarray(member.ts)[None], np.asarray(batch.y0), np.asarray(batch.vectors)
+        given = tuple(map(np.asarray, (batch.ts, batch.y0, batch.vectors)))
         return compute_in_doubles(run, *given) if member.is_single else run(*given)
 
 

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._engine._problem import Problem, Solution, evaluate_condition, has_own_root_finder, signs_of_event
+from lagjax._engine._problem import Problem, Solution, evaluate_condition, signs_of_event
 from lagjax._engine.taylor import _primitives
 from lagjax._engine.taylor._flow import Flow, Tolerances
 from lagjax._engine.taylor._surfaces import Surfaces, crossing_variation, jumps_through_zero, require_one_number
@@ -55,17 +55,16 @@ def surfaces_of_event(problem: Problem) -> Surfaces:
 def _surfaces_of_event(problem: Problem) -> Surfaces:
     event = problem.event
     assert event is not None
-    if has_own_root_finder(event):
+    if event.root_finder is not None:
         raise Unlowerable("the event has a root finder of its own")
-    conditions = jax.tree.leaves(event.cond_fn, is_leaf=lambda leaf: callable(leaf))
-    if any(eqx.is_array(leaf) for leaf in jax.tree.leaves(conditions)):
+    if any(eqx.is_array(leaf) for leaf in jax.tree.leaves(event.conditions)):
         raise Unlowerable("the event holds arrays of its own")
     signs = signs_of_event(problem)
     if None in signs:
         raise Unlowerable("the event is true or false, and no comparison of two numbers")
-    ways = jax.tree.leaves(event.direction, is_leaf=lambda leaf: leaf is None)
-    directions = tuple(sign or (0 if way is None else 1 if way else -1) for sign, way in zip(signs, ways, strict=True))
-    surfaces = surfaces_of(problem, tuple(conditions), directions, "An event")
+    pairs = zip(signs, event.ways, strict=True)
+    directions = tuple(sign or (0 if way is None else 1 if way else -1) for sign, way in pairs)
+    surfaces = surfaces_of(problem, tuple(event.functions), directions, "An event")
     return surfaces._replace(holds=tuple(map(bool, signs)))
 
 

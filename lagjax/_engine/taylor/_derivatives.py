@@ -16,11 +16,11 @@ import numpy as np
 
 from lagjax import _native
 from lagjax._engine._problem import Solution
-from lagjax._engine.taylor._flow import EXCESS, Flow, Steps, Tolerances
+from lagjax._engine.taylor._flow import EXCESS, Flow, Tolerances
 from lagjax._engine.taylor._line_functions import Line
 from lagjax._engine.taylor._passages import cut_steps, has_passages, part_passages
 from lagjax._interface import SUCCESSFUL
-from lagjax._native import Projection
+from lagjax._native import Projection, Steps
 from lagjax._program import pullback, pushforward
 from lagjax._tracing import Program
 
@@ -106,7 +106,7 @@ def _jvp_over_steps(flow: Flow, motions: Motions, dots, tolerances) -> tuple[np.
 
     def advance_tangents(steps: Steps):
         rows, of = steps.rows, motions.take(steps.rows)
-        given = of.ts, of.params, steps.record, dy0[rows], dparams[rows]
+        given = of.ts, of.params, steps, dy0[rows], dparams[rows]
         path_dot[rows], y_dot[rows], excess = steps.kernel.jvp(*given, tolerances.floor)
         return excess / tolerances.largest_excess
 
@@ -181,7 +181,7 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
 
     def transpose_steps(steps: Steps):
         rows, of = steps.rows, motions.take(steps.rows)
-        given = of.ts, of.params, steps.record, path_ct[rows], end_ct[rows]
+        given = of.ts, of.params, steps, path_ct[rows], end_ct[rows]
         y_ct[rows], params_ct[rows], excess = steps.kernel.vjp(*given)
         return excess / tolerances.largest_excess
 
@@ -194,7 +194,7 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
         of = motions.take(steps.rows)
         found = np.isfinite(np.concatenate([y_ct[steps.rows], params_ct[steps.rows]], axis=1))
         y_dot, params_dot = np.split(np.where(found[:, None], directions, 0.0), [flow.states], axis=2)
-        given = of.ts[:, [0, -1]], of.params, steps.record, y_dot, params_dot
+        given = of.ts[:, [0, -1]], of.params, steps, y_dot, params_dot
         _, end, excess = steps.kernel.jvp(*given, tolerances.floor)
         return np.where(np.isfinite(end).all(axis=-1).any(axis=-1), excess / tolerances.largest_excess, np.nan)
 

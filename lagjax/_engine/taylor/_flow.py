@@ -5,7 +5,7 @@ functions of both that JAX can transform.
 """
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ from lagjax._engine._stop_reason import End, what_stopped
 from lagjax._engine.taylor._variational import tangent_programs
 from lagjax._equations import forms
 from lagjax._interface import RESULTS, SUCCESSFUL, code_of
+from lagjax._native import Steps
 from lagjax._program import Unlowerable, machine_memory
 from lagjax._tracing import Program
 
@@ -75,33 +76,6 @@ def require_fit(program: Program, size: int) -> None:
             f"kernel and derivatives fit into half of this machine's {machine_memory() / 1e9:.0f} GB of memory"
         )
     _native.recurrences(program, size)  # raises where an operation has none
-
-
-class Steps(NamedTuple):
-    """The steps of members of a run in one kernel, by a series of this order.
-
-    A row of `table` holds the time and the size of a step, the numbers of its member and of the step, and its first
-    state; those of the members that are the `rows` (M,) of the run are `counts` (M,) rows from `first` (M,) on.
-    """
-
-    kernel: _native.Kernel
-    order: int
-    table: np.ndarray
-    first: np.ndarray
-    counts: np.ndarray
-    rows: np.ndarray
-
-    def take(self, places) -> "Steps":
-        return self._replace(first=self.first[places], counts=self.counts[places], rows=self.rows[places])
-
-    @property
-    def record(self) -> _native.StepRecord:
-        return _native.StepRecord(self.table, self.first, self.counts, self.order)
-
-    def split_members(self) -> Iterator[tuple[int, np.ndarray]]:
-        """The row of each member, and those of the table that are its steps."""
-        for row, first, count in zip(self.rows.tolist(), self.first, self.counts, strict=True):
-            yield row, self.table[first : first + count]
 
 
 # ---- flows -----------------------------------------------------------------------------------------------------------
@@ -222,7 +196,7 @@ class Flow:
         if done.table is not None and done.complete is not None:
             rows = np.flatnonzero(done.complete)
             counts, order = done.steps[rows], order or _native.order_for(rtol)
-            found.append(Steps(self.kernel, order, done.table, np.cumsum(counts) - counts, counts, rows))
+            found.append(Steps(done.table, np.cumsum(counts) - counts, counts, order, self.kernel, rows))
         if not (result == SUCCESSFUL).all():
             again, flow, tolerances = self._second_chance(solution, ts, params, tolerances)
             if again.any():

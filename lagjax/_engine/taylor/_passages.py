@@ -7,8 +7,8 @@ time s is nothing to the motion. Its slope is one of s^0.5, and to tangents that
 
 import numpy as np
 
-from lagjax._engine.taylor._flow import Flow, Steps, Tolerances
-from lagjax._native import Kernel
+from lagjax._engine.taylor._flow import Flow, Tolerances
+from lagjax._native import Kernel, Steps
 from lagjax._program import eliminate_dead_code
 
 # The parts of a passage grow by `GROWTH`; of the first one, `NEAREST` of the passage, the slope is nothing either.

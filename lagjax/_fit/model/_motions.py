@@ -77,7 +77,7 @@ class AbstractMotions(abc.ABC):
 
     @abc.abstractmethod
     def rate(self, t: np.ndarray, y: np.ndarray, numbers: np.ndarray, table: SampleTable | None = None) -> np.ndarray:
-        """q̈ (M, n) at M states `y` (M, 2n) and times `t` (M,), with parameters (M, P) and a table of inputs for each."""
+        """q̈ (M, n) at M states `y` (M, 2n) and times `t` (M,), with parameters (M, P) and a table of inputs each."""
 
 
 def choose_motions(

@@ -9,6 +9,7 @@ record depends on the unknowns that all share and on its own: its `columns` amon
 """
 
 import functools
+import re
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -200,11 +201,9 @@ class Parameters:
 
     def directions(self, u: np.ndarray) -> np.ndarray:
         """The derivatives of the numbers of every record by the unknowns that these depend on, (R, L, P)."""
-        found, (record, column, number, which) = (
-            np.zeros((*self.unknowns.columns.shape, self.places.shape[1])),
-            self._seen,
-        )
-        found[record, column, number] = self._slopes(u)[2][which]
+        found = np.zeros((*self.unknowns.columns.shape, self.places.shape[1]))
+        *places, which = self._seen
+        found[tuple(places)] = self._slopes(u)[2][which]
         return found
 
     def ends(self, u: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -310,6 +309,22 @@ class Parameters:
                 parts.append(part._replace(places=part.places[~stays], owners=owners))
             names += [name for name, kept_too in zip(self.names[rows], stays, strict=True) if not kept_too]
         return replace(self, first=self.numbers(u), parts=tuple(parts), names=tuple(names))
+
+    def extend(self, u: np.ndarray, rows: slice) -> tuple["Parameters", np.ndarray]:
+        """The parameters of one more record with numbers of its own, and u (F,) where these are in the middle of those
+        of the records `rows`."""
+        own, moved = self.unknowns.columns[rows, : self.unknowns.own], np.append(u, 0.0)
+        moved[own[0]] = moved[own].mean(axis=0)
+        return self.select([rows.start]), moved[:-1]
+
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """The names of the free numbers (X,) without the record: `params['bias']`, or `params['bias'][:, 0]`."""
+        found = list(self.names)
+        for _, rows, part in self._cuts:
+            for k in range(rows.start, rows.stop) if part.owners.max() >= 0 else ():
+                found[k] = re.sub(r"\[\d+(?:, )?([\d, ]*)\]$", lambda m: f"[:, {m[1]}]" if m[1] else "", found[k])
+        return tuple(found)
 
     @property
     def example(self) -> np.ndarray:
@@ -425,7 +440,7 @@ def _fitted_mask(label: str, leaf, may_move, free) -> np.ndarray:
     """True for each number of a leaf (n,) that is fitted. Raises where the user asks to fit one that cannot move."""
     wanted = np.asarray(True if may_move is per_record else may_move)
     if wanted.dtype != bool:
-        raise TypeError(f"free must hold True, False or lagjax.per_record; got {may_move!r} for {label}.")
+        raise TypeError(f"free must hold True or False, or lagjax.per_record; got {may_move!r} for {label}.")
     if wanted.shape not in ((), np.shape(leaf)):
         raise ValueError(
             f"free must hold True, False, or an array of them of the shape {np.shape(leaf)} for {label}; got one of "

@@ -6,11 +6,12 @@ those of its own record (`Unknowns`): the rows of a piece, D = 2n + L columns an
 triangle of D + 1 rows (QR), in which all sums of squares are the same.
 
 **One system is a list of one.** Each system has its own coordinates, sensors and inputs; all share u. Once the start of
-a piece is eliminated only the columns of the parameters are left, so that the search does not know of systems. Rows of all systems are made alike: a start has room for the most coordinates, of which a
-smaller system leaves the last ones without any influence, like those of a start that is known; and the signals of all
-systems stand side by side, with no weight where a record does not have them.
+a piece is eliminated only the columns of the parameters are left, so that the search does not know of systems. Rows of
+all systems are made alike: a start has room for the most coordinates, of which a smaller system leaves the last ones
+without any influence, like those of a start that is known; and the signals of all systems stand side by side, with no
+weight where a record does not have them.
 
-`Residuals.evaluate` is the map for searches, and `SystemResiduals.trace_residuals` the same for JAX, from which
+`Residuals.evaluate` is the map for searches, and `Residuals.trace` the same for JAX, from which
 densities have their gradients: back over the steps of motions, where trials go forward along every unknown.
 """
 

@@ -44,7 +44,17 @@ def unseen_sentences(descent: Descent, known: Information) -> tuple[str, ...]:
         triangles = residuals.triangles(other, factors)
         there = confirmed_null(residuals, other, null_space(triangles, residuals.states, residuals.unknowns)[0])
         spaces.append((parameters.jacobian(near) @ there, parameters.values(near)))
-    found = [_sentence(parameters, block, spaces) for block in _blocks(spaces[0][0])]
+    blocks, elements = _blocks(spaces[0][0]), np.array(parameters.elements)
+    alone = [int(block[0]) for block in blocks if len(block) == 1]
+    nowhere = {name for name in elements[alone] if np.isin(np.flatnonzero(elements == name), alone).all()}
+    nowhere -= {*parameters.names}  # those that all share
+    found = [
+        f"Nothing that was measured in any record depends on {elements[block[0]]}."
+        if len(block) == 1 and elements[block[0]] in nowhere
+        else _sentence(parameters, block, spaces)
+        for block in blocks
+    ]
+    found = [*dict.fromkeys(found)]
     if not found:
         ended = dict.fromkeys(parameters.labels[i] for i in np.flatnonzero(np.abs(null).max(axis=1) > 1e-6))
         found = [f"At the end of its set, where nothing that was measured depends on it: {', '.join(ended)}."]

@@ -74,10 +74,11 @@ class Information(NamedTuple):
         return self.lost * self.white if self.null.size else self.covariance
 
     def select(self, places: np.ndarray) -> "Information":
-        """The information about some of the parameters, without what the others would do."""
+        """The information about the unknowns at `places`, F for none, without what the others would do."""
         pair = np.ix_(places, places)
-        matrices = {name: getattr(self, name)[pair] for name in ("covariance", "white")}
-        return self._replace(null=self.null[places], confirmed=self.confirmed[places], **matrices)
+        covariance, white = (np.pad(x, (0, 1))[pair] for x in (self.covariance, self.white))
+        null, confirmed = (np.pad(x, ((0, 1), (0, 0)))[places] for x in (self.null, self.confirmed))
+        return self._replace(covariance=covariance, white=white, null=null, confirmed=confirmed)
 
     def quantile(self, level: float) -> float:
         """Student's t of a level, for the effective number of samples less that of parameters."""
@@ -207,15 +208,13 @@ def eliminate_starts(triangles: np.ndarray, slopes: np.ndarray, states: int) -> 
     return slopes[..., states:] - np.matmul(slopes[..., :states], instead.reshape(shape))
 
 
-def covariance_of_one_start(
-    rows: np.ndarray, states: int, known: Information, share: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """The covariance (2n, 2n) of a start for fixed parameters, and A⁺B, from weighted rows (T, S, 2n + F) of which each
-    sample is worth the `share` of an independent one."""
+def covariance_of_one_start(rows: np.ndarray, states: int, known: Information) -> tuple[np.ndarray, np.ndarray]:
+    """The covariance (K, K) of the first `states` columns for fixed others, and how they follow these, from weighted
+    rows (T, S, K + L) of samples that count for what they are worth."""
     flat = rows.reshape(-1, rows.shape[-1])
     decided = decide(flat[:, :states], _UNFELT)
     half = decided.right[:, : int(decided.rank)] / decided.values[: int(decided.rank)]
-    return known.lost / share * half @ half.T, decided.least_norm(flat[:, states:].T).T
+    return known.lost * half @ half.T, decided.least_norm(flat[:, states:].T).T
 
 
 def signal_deviations(slopes: np.ndarray, states: int, start: np.ndarray, follows: np.ndarray, known: Information):

@@ -24,7 +24,13 @@ from lagjax._fit.model._records import (
 from lagjax._fit.model._residuals import Point, Residuals, SystemResiduals
 from lagjax._fit.model._sensors import wrap_residuals
 from lagjax._fit.result._comparison import effective_share
-from lagjax._fit.result._information import LEVEL, covariance_of_one_start, require_level, signal_deviations
+from lagjax._fit.result._information import (
+    LEVEL,
+    Information,
+    covariance_of_one_start,
+    require_level,
+    signal_deviations,
+)
 from lagjax._fit.search._descent import minimise
 from lagjax._fit.search._reader import build_reader, read_start
 from lagjax._run import Trajectory, simulate
@@ -79,31 +85,27 @@ def predict_record(fit, record: Record, system: str | None) -> Prediction:
     form, noise = part.signals.form, part.sensor_noise(fit.noise_scale)
     if form is not None:
         require_interpolation(record, form.hold, "the record")
-    layout, n, parameters = part.layout, part.layout.size, _parameters_of(fit, record)
-    numbers = parameters.numbers(fit.u)[parameters.places[0]]
-    params = parameters.restore(numbers)
-    state = known_start(record, layout, 0, params)
+    layout, n, about = part.layout, part.layout.size, _find_parameters(fit, part, record)
+    state = known_start(record, layout, 0, about.params)
     is_fitted = state is None or isinstance(record.start, Guess)
     if state is None:
-        state = read_start(build_reader(record, part, numbers), record, part, "This record")
+        state = read_start(build_reader(record, part, about.numbers), record, part, "This record")
     fixed = part.with_records([record], np.array([is_fitted]), part.manifold)
-    residuals = Residuals([fixed], parameters.fix(fit.u, np.ones(len(fit.u), bool)))
-    point = Point(np.zeros(0), state[None])
-    trial = minimise(residuals, point, KnownNoise(noise), 1e-3).trial if is_fitted else residuals.evaluate(point)
-    state = trial.starts[0]
+    moves = np.isin(np.arange(len(about.u)), about.own)
+    residuals, point = Residuals([fixed], about.parameters.fix(about.u, ~moves)), Point(about.u[moves], state[None])
+    done = is_fitted or moves.any()
+    trial = minimise(residuals, point, KnownNoise(noise), 1e-3).trial if done else residuals.evaluate(point)
+    state, about.u[moves] = trial.starts[0], trial.u
     start = layout.restore(state[:n]), layout.restore(state[n:])
     q0, qdot0, ts = jax.tree.map(lambda x: np.asarray(x, layout.dtype), (*start, record.ts))
-    scene = part.scene
+    scene, params = part.scene, about.params
     if form is not None:
         scene, params = form.bind_samples(scene, params, record.sampled_at, record.input_samples)
     trajectory = simulate(scene, q0, qdot0, ts, params)
-    planned, slopes = _follow_record(fit, part, parameters, record, state)
-    known = fit.information.select(parameters.unknowns.columns[0])
-    own, follows = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, len(known.covariance)))
-    if is_fitted:
-        rows = np.sqrt(record.weight_matrix)[..., None] / noise.sigma[:, None] * slopes
-        own, follows = covariance_of_one_start(rows, 2 * n, known, effective_share(fit))
-    deviation = signal_deviations(slopes, 2 * n, own, follows, known)
+    planned, slopes = _follow_record(about, part, record, state)
+    weights = record.weight_matrix * effective_share(fit) / noise.sigma**2
+    own, follows = about.covariance(np.sqrt(weights)[..., None] * slopes, 2 * n, is_fitted)
+    deviation = signal_deviations(slopes, 2 * n + len(about.own), own, follows, about.known)
     missed = wrap_residuals(planned.matrix - record.matrix, part.signals.periods)
     missed = np.where(record.weight_matrix > 0, missed, np.nan)
     values, missed, deviation = (restore_structure(x, record) for x in (planned.matrix, missed, deviation))
@@ -111,22 +113,51 @@ def predict_record(fit, record: Record, system: str | None) -> Prediction:
     return Prediction(trajectory, values, missed, start, deviation, noise)
 
 
-def _parameters_of(fit, record: Record) -> Parameters:
-    """The parameters of a fit for one record. Raises `ValueError` where they are not those of another record."""
-    parameters, own = fit.parameters, [k for k, one in enumerate(fit.records) if one is record]
-    if not own and (parameters.places != parameters.places[0]).any():
-        raise ValueError(
-            "This fit has numbers of every record (lagjax.per_record), and this record is none of fit.records: give one "
-            "of these, or fit it with the numbers that all share kept, free=lagjax.per_record for its own alone."
-        )
-    return parameters.select(own[:1] or [0])
+class _RecordParameters(NamedTuple):
+    """The parameters of a fit for one record at u (F,), and what is `known` of those that its values do not determine:
+    all but its `own`, the places in u of the numbers that a record which was not fitted does not share."""
+
+    parameters: Parameters
+    u: np.ndarray
+    own: np.ndarray
+    known: Information
+
+    @property
+    def numbers(self) -> np.ndarray:
+        return self.parameters.numbers(self.u)[self.parameters.places[0]]
+
+    @property
+    def params(self) -> PyTree:
+        return self.parameters.restore(self.numbers)
+
+    def covariance(self, rows: np.ndarray, states: int, fits_start: bool) -> tuple[np.ndarray, np.ndarray]:
+        """The covariance (K, K) of the start and the numbers of its own that are fitted to a record with weighted
+        `rows` (T, S, 2n + L), zero for a start that is not, and how they follow what all records share (K, …)."""
+        count = states + len(self.own)
+        fitted = np.append(np.full(states, fits_start), np.ones(len(self.own), bool))
+        own, follows = np.zeros((count, count)), np.zeros((count, rows.shape[-1] - count))
+        if fitted.any():
+            some = np.concatenate([rows[..., :count][..., fitted], rows[..., count:]], axis=-1)
+            own[np.ix_(fitted, fitted)], follows[fitted] = covariance_of_one_start(some, int(fitted.sum()), self.known)
+        return own, follows
 
 
-def _follow_record(fit, system: SystemResiduals, parameters: Parameters, record: Record, state: np.ndarray):
+def _find_parameters(fit, part: SystemResiduals, record: Record) -> _RecordParameters:
+    parameters, places = fit.parameters, [k for k, one in enumerate(fit.records) if one is record]
+    u, own = fit.u.copy(), np.zeros(0, int)
+    if places or not parameters.unknowns.own:
+        parameters = parameters.select(places[:1] or [0])
+    else:
+        parameters, u = parameters.extend(u, part.frame.records)
+        own = parameters.unknowns.columns[0, : parameters.unknowns.own]
+    return _RecordParameters(parameters, u, own, fit.information.select(parameters.unknowns.columns[0, len(own) :]))
+
+
+def _follow_record(about: _RecordParameters, system: SystemResiduals, record: Record, state: np.ndarray):
     """A record with what sensors would show for its values, from a state (2n,), and their derivatives (T, S, D)."""
     everywhere = replace(record, values=restore_structure(np.zeros_like(record.matrix), record), weights=None)
-    residuals = Residuals([system.with_records([everywhere], np.array([True]))], parameters)
-    trial = residuals.evaluate(Point(fit.u, state[None]))
+    residuals = Residuals([system.with_records([everywhere], np.array([True]))], about.parameters)
+    trial = residuals.evaluate(Point(about.u, state[None]))
     shown = np.where(residuals.weights.reshape(record.matrix.shape) > 0, trial.residuals[0][0], np.nan)  # of a delay
     return replace(record, values=restore_structure(shown, record)), trial.slopes[0][0]
 
@@ -137,14 +168,14 @@ def planned_rows(fit, part: SystemResiduals, name: str, record: Record) -> np.nd
         raise ValueError(
             f"The planned record {name} needs a start: (q0, qdot0), or lagjax.Guess(q0, qdot0) to be fitted."
         )
-    parameters = _parameters_of(fit, record)
-    state = known_start(record, part.layout, 0, parameters.restore(parameters.numbers(fit.u)[parameters.places[0]]))
+    about = _find_parameters(fit, part, record)
+    state = known_start(record, part.layout, 0, about.params)
     assert state is not None
-    planned, slopes = _follow_record(fit, part, parameters, record, state)
+    planned, slopes = _follow_record(about, part, record, state)
     sigma = part.sensor_noise(fit.noise_scale).sigma[:, None]
     weights = planned.weight_matrix[..., None] * (effective_share(fit) / sigma**2)
-    rows, states = np.sqrt(weights) * slopes, part.states
-    own = rows[..., states:]
-    if isinstance(record.start, Guess):
-        own = own - rows[..., :states] @ covariance_of_one_start(rows, states, fit.information, 1.0)[1]
-    return own.reshape(-1, own.shape[-1])
+    rows, count = np.sqrt(weights) * slopes, part.states + len(about.own)
+    follows = about.covariance(rows, part.states, isinstance(record.start, Guess))[1]
+    found = np.zeros((*rows.shape[:2], len(fit.u)))
+    found[..., about.parameters.unknowns.columns[0, len(about.own) :]] = rows[..., count:] - rows[..., :count] @ follows
+    return found.reshape(-1, len(fit.u))

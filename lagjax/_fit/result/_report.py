@@ -100,6 +100,8 @@ def _build_pictures(fit) -> dict[str, list[str]]:
         of_one = "" if part.name is None else f"{part.name}: "
         figures |= {of_one + heading: pictures for heading, pictures in _draw_records(fit, part).items()}
     names, matrix = fit.covariance
+    shared = np.flatnonzero(np.array(names) == np.array(fit.parameters.elements))  # one line a record hides the others
+    names, matrix = tuple(names[k] for k in shared), matrix[np.ix_(shared, shared)]
     if names:
         side = min(3.2 + 0.45 * len(names), 12.0)
         picture = render_picture((side + 1.0, side), lambda f: draw_correlations(f.subplots(), matrix, names), _DPI)
@@ -166,16 +168,28 @@ def _parameter_cells(fit) -> list[list[str]]:
     """The table of the free numbers, its head first: of long arrays their number."""
     rows = [["parameter", "value", f"{100 * LEVEL:g} % interval", "relative"]]
     low, high = fit._ends(LEVEL)
+    names, values, elements = fit.parameters.names, fit.parameters.values(fit.u), np.array(fit.parameters.elements)
     owners = [part.label for part in fit.parameters.parts for _ in part.places]
-    many = {label: count for label, count in Counter(owners).items() if count > _LISTED}
-    rows += [[label, f"{count} numbers", "", ""] for label, count in many.items()]
-    numbers = zip(owners, fit.parameters.names, fit.parameters.values(fit.u), low, high, strict=True)
-    for owner, name, x, a, b in numbers:
-        if owner not in many:
-            relative = 50 * (b - a) / abs(x) if x else np.inf
+    count_of, told = Counter(owners), set()
+    for k, (owner, element, name) in enumerate(zip(owners, elements.tolist(), names, strict=True)):
+        if element != name and element not in told:
+            own = elements == element
+            rows.append(_record_cells(element, values[own], 0.5 * (high - low)[own]))
+        elif element == name and count_of[owner] <= _LISTED:
+            relative = 50 * (high[k] - low[k]) / abs(values[k]) if values[k] else np.inf
             shown = f"± {relative:.2g} %" if np.isfinite(relative) else "not seen"
-            rows.append([name, f"{x:.6g}", f"{a:>12.6g} … {b:>12.6g}", shown])
+            rows.append([name, f"{values[k]:.6g}", f"{low[k]:>12.6g} … {high[k]:>12.6g}", shown])
+        elif element == name and owner not in told:
+            rows.append([owner, f"{count_of[owner]} numbers", "", ""])
+        told |= {owner, element}
     return rows
+
+
+def _record_cells(name: str, values: np.ndarray, half_widths: np.ndarray) -> list[str]:
+    """The line of a number that has a value in every record: the mean, the scatter, and how well one is known."""
+    scatter = np.std(values, ddof=1) if len(values) > 1 else 0.0
+    each = f"each ± {np.median(half_widths):.2g}" if np.isfinite(half_widths).all() else "not seen in every record"
+    return [name, f"{np.mean(values):.6g}", f"scatter {scatter:.3g} over {len(values)} records", each]
 
 
 def _noise_cells(fit) -> list[list[str]]:

@@ -67,7 +67,8 @@ class SignalNoise(NamedTuple):
 class Fit:
     """The result of `fit`. Print it for a table with intervals and a verdict.
 
-    - `params`: the parameters in the user's pytree; the free ones are those of maximum likelihood.
+    - `params`: the parameters in the user's pytree; the free ones are those of maximum likelihood. One that is
+      `lagjax.per_record` is an array with the records as first axis.
     - `starts`: one (q0, qdot0) per record. For several systems `starts` and `residuals` are dicts by their names.
     - `covariance`: of the free numbers, by name (`Covariance`).
     - `noise`: the scatter of each signal, by name (`SignalNoise`).
@@ -217,9 +218,10 @@ class Fit:
         """The motion of the fitted scene over a record, which need not be one of those that were fitted.
 
         It begins at the record's start if that is known, else at the start that fits the record's values best with the
-        parameters kept. To predict from the first samples alone, let `predict` find the start of a short record, and
-        give that start to a `Record` of the whole. `system` is the name of the record's system, for a fit of several
-        systems.
+        parameters kept. Numbers that are `lagjax.per_record` are those of the fit for one of `records`, and for another
+        record those that fit its values best. To predict from the first samples alone, let `predict` find the start of
+        a short record, and give that start to a `Record` of the whole. `system` is the name of the record's system, for
+        a fit of several systems.
 
         Raises `ValueError` where the record has different signals from those of the fit, or its motion fails.
         """

@@ -121,7 +121,8 @@ def _describe_missed_limits(residuals: Residuals, trial: Trial) -> list[str]:
 
 
 def _describe_bends(descent: Descent, known: Information) -> list[str]:
-    """Sentences for numbers that all records share, on one side of which the likelihood falls by less than half of what an interval says."""
+    """Sentences for numbers that all records share, where the likelihood falls on one side by less than half of what an
+    interval says."""
     residuals, trial, found = descent.residuals, descent.trial, []
     if known.null.shape[1] or not any(jumps(part.scene) for part in residuals.parts):
         return found

@@ -5,35 +5,19 @@ bump and a pulse of the force), constrained ones (a double pendulum in Cartesian
 dead centres) and events (waves, grazing, two crossings 2e-5 apart). Else neither factor changed a step.
 """
 
-from typing import NamedTuple
-
 EPS = 2.0**-52  # from 1 to the next double
-
-
-class Digits(NamedTuple):
-    """The rounding of the numbers of a state, and of what is computed from them.
-
-    - `round_off`: the relative rounding error of an acceleration, and of a projected state: some hundred operations,
-      each half a unit in the last place. A scaled defect may contain it. It allows for cancellation: in the motions
-      above neither factor changed a step.
-    - `unit`: the relative rounding error of q, a few units in the last place. It changes an acceleration in proportion
-      to the variation of the acceleration along the step.
-    - `largest_unit`: if `unit` |q| exceeds this fraction of the change of q along the step, the variation of the
-      acceleration is rounding, and is not counted. Measured on a pendulum after half a million turns at rtol = 1e-12,
-      below the resolution of its angle: without, 274 steps and 328 rejected; with it 180 and 193; `unit` doubled the
-      same, `largest_unit` doubled 105 and 89.
-    - `small`: squares of smaller numbers may underflow to zero, squares of numbers above 1/`small` may overflow.
-    - `tiny`: terms of smaller numbers are zero or have lost their digits; such a number counts as zero.
-    """
-
-    round_off: float
-    unit: float
-    largest_unit: float
-    small: float
-    tiny: float
-
-
-DIGITS = Digits(256 * EPS, 16 * EPS, 1e-6, 2.0**-400, 2.0**-960)
+# The relative rounding error of an acceleration, and of a projected state: some hundred operations, each half a unit in
+# the last place. A scaled defect may contain it. It allows for cancellation: in the motions above neither factor
+# changed a step.
+ROUND_OFF = 256 * EPS
+# The relative rounding error of q, a few units in the last place. It changes an acceleration in proportion to the
+# variation of the acceleration along the step. If it exceeds the fraction `LARGEST_UNIT` of the change of q along the
+# step, the variation of the acceleration is rounding, and is not counted. Measured on a pendulum after half a million
+# turns at rtol = 1e-12, below the resolution of its angle: without, 274 steps and 328 rejected; with it 180 and 193;
+# `UNIT` doubled the same, `LARGEST_UNIT` doubled 105 and 89.
+UNIT, LARGEST_UNIT = 16 * EPS, 1e-6
+SMALL = 2.0**-400  # squares of smaller numbers may underflow to zero, squares of numbers above 1/`SMALL` may overflow
+TINY = 2.0**-960  # terms of smaller numbers are zero or have lost their digits; such a number counts as zero
 
 # ---- how a member ended ----------------------------------------------------------------------------------------------
 

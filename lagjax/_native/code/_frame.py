@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 
-from lagjax._native.code._constants import DIGITS
 from lagjax._native.code._ir import BIT, DOUBLE, INTEGER, POINTER, Code, Value, element_of
 
 Index = int | Value
@@ -119,8 +118,6 @@ class Vectors:
 
 class Frame:
     """A function of a kernel under construction, with named access to all that it sees."""
-
-    digits = DIGITS
 
     def __init__(self, module: ir.Module, layout: Memory, job: type, name: str, *kinds: ir.Type, **options):
         self.code = Code(module, name, [POINTER] * 3 + list(kinds), layout.width, **options)

@@ -7,7 +7,7 @@
         code.store(y * y + 1.0, row + i * width)
 
 emits the loop. A number is a double, an integer (64 bits) or a vector of doubles, one for each lane. A sum of products
-may be contracted to fused multiply-adds; nothing else about the arithmetic is loosened.
+may be contracted to fused multiply-adds, but in code that `rounds` each; nothing else is loosened.
 """
 
 import ctypes
@@ -214,9 +214,10 @@ class Code:
     """The body of one function, growing at its end."""
 
     def __init__(
-        self, module: ir.Module, name: str, arguments: Sequence[ir.Type], lanes: int, result=None, public=False
-    ):
-        self.lanes, self.vector = lanes, ir.VectorType(DOUBLE, lanes)
+        self, module: ir.Module, name: str, arguments: Sequence[ir.Type], lanes: int, result=None, public=False,
+        rounds=False,
+    ):  # fmt: skip
+        self.lanes, self.vector, self._flags = lanes, ir.VectorType(DOUBLE, lanes), () if rounds else _CONTRACT
         self.module = module
         self.function = ir.Function(module, ir.FunctionType(result or ir.VoidType(), arguments), name)
         if not public:
@@ -251,7 +252,7 @@ class Code:
         a, b = self._match_types(a, b)
         if isinstance(a.it.type, ir.IntType):
             return Value(self, getattr(self.builder, {"div": "sdiv"}.get(op, op))(a.it, b.it))
-        flags = _CONTRACT if op != "div" else ()
+        flags = self._flags if op != "div" else ()
         return Value(self, getattr(self.builder, "f" + op)(a.it, b.it, flags=flags))
 
     def compare(self, op: str, a, b) -> Value:

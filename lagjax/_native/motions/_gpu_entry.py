@@ -1,6 +1,6 @@
 """The entries of programs for GPUs: what a thread does with the members that it takes.
 
-    MOTION       follow them, one after the other, until the counter that all threads share has come to the end
+    MOTION       follow them, one after the other, until the counter that all threads share is at the end
     TRANSPOSE    of each: follow it with its steps written down, and go back over these from the last to the first
 
 The steps of a transpose stand in a record that is the thread's own and serves one member after the other, so that the
@@ -105,7 +105,7 @@ def transpose_entry(motion: OneLane, adjoint: OneLane, form: GpuForm) -> str:
 
 
 class _Thread:
-    """The function `integrate` of an entry; `at` has the addresses of its results and of what is only an argument."""
+    """Emits the GPU kernel `integrate`. `at`: addresses of its array arguments and results, by name."""
 
     def __init__(self, entry: Entry):
         self.module = ir.Module("entry")

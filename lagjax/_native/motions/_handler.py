@@ -2,7 +2,7 @@
 
 XLA calls a handler with a frame, in which are the addresses of the arguments, of the results and of one attribute: that
 of a `Plan`, which says whose machine code is to run, how and how far. One handler serves all kernels. It never waits:
-it begins a run, does as many rounds as take a slice of time, and leaves behind what is needed to go on (`Rest`). The
+it begins a run, does as many rounds as take a slice of time, and leaves behind what is needed to continue (`Rest`). The
 caller looks at the rest, and at how members ended; all that is rare stays in Python. Outside of XLA a `Kernel` begins
 in the same way, with one call.
 
@@ -143,7 +143,7 @@ def handler() -> Handler:
 
 
 def compile_handler(name: str, arguments: int, results: int, write: Callable, *public: str) -> dict[str, int]:
-    """The addresses of a `handler`, `XLA_FFI_Error* (XLA_FFI_CallFrame*)`, and of the `public` functions beside it.
+    """The addresses of a `handler`, `XLA_FFI_Error* (XLA_FFI_CallFrame*)`, and of the `public` functions with it.
 
     They hold as long as the process. `write(module)` gives what the handler does, `work(code, plan, data, dims)`: with
     the address that is the attribute, with those of the arguments and results, and with those of their sizes.

@@ -4,7 +4,7 @@ import ctypes
 import functools
 import itertools
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -54,13 +54,26 @@ class Outcome(NamedTuple):
     complete: np.ndarray | None  # (N,), whether all steps of a member are there, Σ steps of such members before it on
 
 
-class StepRecord(NamedTuple):
-    """The steps of N members, by series of this `order`: `counts[k]` rows of `table` from `first[k]` on of member k."""
+class Steps(NamedTuple):
+    """The steps of N members, by series of this `order`: `counts[k]` rows of `table` from `first[k]` on of member k.
+
+    The table is that of an `Outcome`. Where it is one of several runs, member k was number `rows[k]` of its `kernel`'s.
+    """
 
     table: np.ndarray
     first: np.ndarray
     counts: np.ndarray
     order: int
+    kernel: Any = None
+    rows: Any = None
+
+    def take(self, places) -> "Steps":
+        return self._replace(first=self.first[places], counts=self.counts[places], rows=self.rows[places])
+
+    def split_members(self) -> Iterator[tuple[int, np.ndarray]]:
+        """The row of each member, and those of the table that are its steps."""
+        for row, first, count in zip(self.rows.tolist(), self.first, self.counts, strict=True):
+            yield row, self.table[first : first + count]
 
 
 class Begun(NamedTuple):
@@ -221,7 +234,7 @@ class Kernel:
         shaped = path.reshape(members, times, states), y_end.reshape(members, states)
         return Begun._make([*shaped, *others, changes.reshape(members, guards), rest])
 
-    def vjp(self, ts, params, record: StepRecord, path_ct, y_ct) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def vjp(self, ts, params, record: Steps, path_ct, y_ct) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The transposed derivative of a run, over the steps it wrote down.
 
         From the cotangents of the outputs, `path_ct` (N, T, 2n), of which the first and the last are not looked at, and
@@ -241,7 +254,7 @@ class Kernel:
         return kernel._backward, min(kernel.threads(members * MOTIONS_PER_ADJOINT), -(-members // kernel.width))
 
     def jvp(
-        self, ts, params, record: StepRecord, y_dot, params_dot, floor: float
+        self, ts, params, record: Steps, y_dot, params_dot, floor: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The derivative of a run along m directions, over the steps it wrote down.
 
@@ -260,7 +273,7 @@ class Kernel:
         return results
 
     def _go_over(
-        self, kernel: "tuple[_Compiled, int]", ts, params, record: StepRecord, arrays: dict, **numbers: float
+        self, kernel: "tuple[_Compiled, int]", ts, params, record: Steps, arrays: dict, **numbers: float
     ) -> None:
         """Run a kernel of derivatives, with its number of threads, over the steps of a record; `arrays` are its own."""
         names = ("ts", "params", "record", *arrays)

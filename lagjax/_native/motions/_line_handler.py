@@ -26,7 +26,8 @@ class LineCode:
     At its `address` is `evaluate(x, out, rows)`, with x (rows, inputs) and out (rows, outputs). A line of more than
     `largest` operations is a walk along rows of integers, for which LLVM takes no longer. Where its first inputs, so
     many, are `moving`, that gives the running errors of the outputs in their place (`_program._rounding`): a line of
-    them would be five times as long. What is written out may take several rows at once, in `lanes`. Raises
+    them would be five times as long. What is written out may take several rows at once, in `lanes`. Every operation
+    rounds, so that all of these forms have the same digits on every processor, and in C (`_c_lines`). Raises
     `Unlowerable`.
     """
 
@@ -39,10 +40,10 @@ class LineCode:
         long = moving is not None or len(line.nodes) + len(filled) > largest
         lanes = 1 if long else lanes
         turns = any(op in ("sin", "cos") for op, _, _ in line.nodes)
-        sincos = sincos_function(module, lanes) if turns else None
+        sincos = sincos_function(module, lanes, rounds=True) if turns else None
         write = _RowWalk(line, inputs, filled, moving) if long else None
         room = 1 if write is None else 2 ** math.ceil(math.log2(2 * write.size))
-        code = Code(module, "evaluate", [POINTER, POINTER, INTEGER], lanes, public=True)
+        code = Code(module, "evaluate", [POINTER, POINTER, INTEGER], lanes, public=True, rounds=True)
         (x, out, rows), room = code.arguments, code.stack(room)
         if lanes > 1:
             _write_tiles(code, sincos, line, inputs, filled)

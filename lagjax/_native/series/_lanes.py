@@ -177,13 +177,13 @@ COS = (4.16666666666666019037e-02, -1.38888888888741095749e-03, 2.48015872894767
 # fmt: on
 
 
-def sincos_function(module: ir.Module, lanes: int, name: str = "sincos") -> Code:
+def sincos_function(module: ir.Module, lanes: int, name: str = "sincos", rounds: bool = False) -> Code:
     """`(x, address)`: sin x and cos x, stored one after the other.
 
     Cody and Waite's reduction (*Software Manual for the Elementary Functions*, 1980), fdlibm's polynomials; 1 ulp. A
     vector with an angle beyond `LARGEST_ANGLE` asks the C library as well.
     """
-    code = Code(module, name, [ir.VectorType(DOUBLE, lanes), POINTER], lanes)
+    code = Code(module, name, [ir.VectorType(DOUBLE, lanes), POINTER], lanes, rounds=rounds)
     x, address = code.arguments
     near = abs(x) <= LARGEST_ANGLE
     sine, cosine = _polynomials(code, code.select(near, x, 0.0))

@@ -1,4 +1,4 @@
-"""The tangents of a motion along directions, as functions of a kernel see them: beside the memory of the motion."""
+"""The tangents of a motion along directions, as functions of a kernel see them, in memory of their own."""
 
 from typing import Any
 

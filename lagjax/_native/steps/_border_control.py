@@ -73,9 +73,9 @@ class BorderControl:
         }
         if groups := joint_groups(borders):
             fields |= {
-                "joins": guards,  # where a guard is crossed, as a part of the step; then 1 if it is, at its end
+                "joins": guards,  # where a guard is crossed, as a fraction of the step; then 1 if it is, at its end
                 "taken": 1 + max(groups),  # 1 for a group of which a guard is crossed
-                "more": 1,  # guards that are crossed beside the first one: each counts as a step, which it is elsewhere
+                "more": 1,  # guards that are crossed in addition to the first one: each counts as a step, as elsewhere
             }
         if borders.kicking:
             fields |= Kicks.fields(pieces)
@@ -162,8 +162,8 @@ class BorderControl:
     def _is_rounding(self, frame: Frame, border: Border, degree: Value) -> Value:
         """True if a guard whose polynomial is in `poly` leaves a border that the motion touches by rounding alone.
 
-        A move of less than a part of atol does not count. Where borders hold together what moves by rounding, they are
-        left and met in turn at one instant: then more is rounding.
+        Less than a fraction of atol does not count. Several active borders can be left and reached alternately
+        because of rounding. Each repetition therefore raises the threshold.
         """
         code = frame.code
         turns = 1.0 + code.maximum(frame["idle_crossings"] - float(len(self.borders.guards)), frame.constant(0.0))
@@ -175,7 +175,7 @@ class BorderControl:
         if self.slides:  # along u = 0 another border of |u| is there by rounding
             touches = touches | (frame["slides"] > 0.0)
         first = [abs(frame["poly", k]) for k in range(3)]  # the last ones may have become zero
-        return (nothing & touches) | (first[0] + first[1] + first[2] < frame.digits.tiny)
+        return (nothing & touches) | (first[0] + first[1] + first[2] < limits.TINY)
 
     def _note_first(self, frame: Frame, border: Border, h: Value, piece: tuple, comes: Value, idle: Value) -> None:
         """Note the root of a guard if it is the first: `beyond` it is that `piece`, or one that is `undecided`.

@@ -115,7 +115,7 @@ class BorderCrossing:
         after = self.motion.evaluate_now(frame, line) if shaken else []
         for k, j in enumerate(shaken):
             jump = abs(after[k] - before[k].value)
-            least = abs(after[k]) * frame.digits.round_off + code.lanes_of(absolute_tolerance(frame))
+            least = abs(after[k]) * limits.ROUND_OFF + code.lanes_of(absolute_tolerance(frame))
             self._let_go(frame, going & (jump > least), [j])
         if shaken:
             self._decide_others(frame, going)

@@ -37,8 +37,8 @@ class Events:
     """The changes of sign of guards, the last of what the series of a motion follow: they end it, or are noted."""
 
     def __init__(self, motion: TaylorSeries, step: StepControl, output: Output, roots: Roots, guards: Guards):
-        self.motion, self.step, self.output, self.roots, self.guards = motion, step, output, roots, guards
-        self.count, self.notes = len(guards.directions), guards.notes
+        self.motion, self.step, self.roots, self.guards = motion, step, roots, guards
+        self.count = len(guards.directions)
         self.first = motion.series.followed - self.count
         program = motion.program
         outputs = program.line.outputs[len(program.line.outputs) - self.count :]
@@ -50,7 +50,7 @@ class Events:
         self.table = Columns(motion.module, ("direction", "piecewise", "holds"), rows)
         self.guard = self._guard()
         self.begin_sides = self._begin_sides()
-        self.note = self._note() if self.notes else None
+        self.note = self._note(output) if guards.notes else None
         self.look = self._look()
 
     @staticmethod
@@ -123,7 +123,9 @@ class Events:
         direction, is_rounded = watch.number("direction"), self.guards.is_rounded
         value, rate, size, rate_size = (frame["measured", g, k] for k in range(4))
         later, noise, rate_noise = watch.recall("guard"), limits.GUARD_NOISE * size, limits.GUARD_NOISE * rate_size
-        before = frame.constant(0.0) if self.notes else 0.0 - direction  # from where it can change in its direction
+        before = (
+            frame.constant(0.0) if self.guards.notes else 0.0 - direction
+        )  # from where it can change in its direction
         if self.guards.remembers:
             before, rate_noise = self._noted(watch)
         of_rate = abs(frame["h"]) * rate_noise
@@ -202,7 +204,7 @@ class Events:
             after = code.maximum(frame["seen"] * size, code.select(least < size, least, size))
             frame.assign(cut, h=after * frame["forward"], last=0.0)
             frame.call(self.look, order)
-        if not self.notes:
+        if not self.guards.notes:
             self._end_at_first(frame)
         with code.loop(self.count) as g:
             for name in MEMORY:
@@ -323,7 +325,7 @@ class Events:
         self._see(frame, searching(), frame["begin"] * frame["part"])
 
     def _see(self, frame: Frame, where: Value, seen: Value) -> None:
-        """Note, in some lanes, that a guard is seen only up to a part of the step."""
+        """Note, in some lanes, that a guard is seen only up to a fraction of the step."""
         frame.assign(where & (seen < frame["seen"]), seen=seen)
 
     def _waits(self, watch: Watch) -> Value:
@@ -364,10 +366,10 @@ class Events:
         return code.select(lost, 0.0, at)  # time does not move
 
     def _take(self, watch: Watch, order: Value, changes: Value, s: Value, ahead: Variable) -> Value:
-        """Changes at the times s: the event, or a note, where they are in the direction; which lanes go on beyond."""
+        """Changes at the times s: the event, or a note, where the direction is right; which lanes continue."""
         frame, code, side, size = watch.frame, watch.code, ahead.value, abs(s)
         counts = changes & ~(side * watch.number("direction") > 0.0)
-        if self.notes:
+        if self.guards.notes:
             assert self.note is not None
             frame["is_due"] = counts
             with code.only_if(code.any_lane(counts)):
@@ -398,11 +400,11 @@ class Events:
 
     # ---- what is noted ----
 
-    def _note(self) -> Code:
+    def _note(self, output: Output) -> Code:
         """`(order, g, s)`: write down a change of guard g and the state there, in the lanes that are due."""
         frame = self.motion.function("note_change", INTEGER, INTEGER, self.motion.vector)
         code, (order, g, s) = frame.code, frame.arguments
-        self.output.interpolate(frame, order, s)
+        output.interpolate(frame, order, s)
         frame["reached"] = frame["t"] + (frame["t_low"] + s)
         with code.loop(self.motion.width) as k:
             lane = frame.lane(k)
@@ -419,7 +421,7 @@ class Events:
     def write_end(self, frame: Frame, lane: Lane) -> None:
         """Write how each guard changes at the end of a member; or, behind its notes, how many there were."""
         with frame.code.loop(self.count) as g:
-            if self.notes:
+            if self.guards.notes:
                 row = self._row(frame, lane["member"], g, frame.job("room_of_notes"))
                 frame.write("path", row, lane["noted", g])
             else:

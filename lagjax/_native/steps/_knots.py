@@ -23,7 +23,7 @@ class Knots:
             self._note_coincidence(frame, h)
 
     def cross(self, frame: Frame, going: Value) -> None:
-        """Go past all knots that the time has come to, at one instant."""
+        """Pass all knots that are at this instant."""
         for j in self.borders.clocks:
             left, inside = self._time_left(frame, j)
             passes = going & inside & (left <= self._instant(frame))

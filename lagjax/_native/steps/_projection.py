@@ -5,7 +5,7 @@ them; here it is a straight line like any other. It must not move the state much
 then the projection has failed, and the step is halved.
 """
 
-from lagjax._native.code._constants import PROJECTION_TOLERANCES, START
+from lagjax._native.code._constants import PROJECTION_TOLERANCES, ROUND_OFF, START
 from lagjax._native.code._frame import Fields, Frame, Index, Numbers
 from lagjax._native.code._ir import Code, Value
 from lagjax._native.series._taylor import TaylorSeries
@@ -48,7 +48,7 @@ class Projector:
         for i in (i + half for half in (0, n) for i in self.motion.form.each(code, self.base_size)):
             far = abs(projected[i] - values[i])
             size = abs(projected[i]) + abs(increments[i])
-            error = (far - frame.digits.round_off * size) * frame["scale", i] * (1 / PROJECTION_TOLERANCES)
+            error = (far - ROUND_OFF * size) * frame["scale", i] * (1 / PROJECTION_TOLERANCES)
             # A start may be off by more, as much as is taken for consistent.
             error = code.select(first, far / (START * (1.0 + size)), error)
             farthest.value = code.largest_or_nan(farthest.value, error)

@@ -1,6 +1,6 @@
 """The beginning of a step on the borders that the motion slides along: the retraction (`_program._sliding`).
 
-    apply    the state; where it was beside them is rounding, which does not add up over steps
+    apply    the state; its distance from them is rounding, which does not add up over steps
     push     tangents of the state as it was; a member's start, too, may be varied off its borders
     pull     cotangents, the transpose of `push`
 

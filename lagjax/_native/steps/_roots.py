@@ -13,7 +13,7 @@ there, and a step that ends there, too, has a series that knows.
 import math
 from collections.abc import Callable
 
-from lagjax._native.code._constants import EPS, MAX_ORDER, MEETS, MOST_HALVINGS, MOST_MOVES, ROOT_NOISE
+from lagjax._native.code._constants import EPS, MAX_ORDER, MEETS, MOST_HALVINGS, MOST_MOVES, ROOT_NOISE, SMALL
 from lagjax._native.code._frame import Fields, Frame
 from lagjax._native.code._ir import INTEGER, Code, Value
 from lagjax._native.series._taylor import TaylorSeries, integer
@@ -142,22 +142,22 @@ class Roots:
         return (frame["is_root"] > 0.0) & (frame["root"] < 1.0)
 
     def place(self, frame: Frame, otherwise: float) -> Value:
-        """The root, or else how far was looked, in parts of the step; `otherwise` if that was all of it."""
+        """The root, or else the end of the search, as a fraction of the step; `otherwise` if that was all of it."""
         code, root, part = frame.code, frame["root"], frame["part"]
         return code.select(root < 1.0, root * part, code.select(part < 1.0, part, otherwise))
 
     def _first_root(self) -> Code:
         frame = self.motion.function("first_root", INTEGER)
         frame["begin"], frame["doubt"], frame["instant"], frame["closer"] = 0.0, 0.0, EPS, 0.0
-        code, small = frame.code, frame.digits.small
+        code = frame.code
         self.sum_up(frame, *frame.arguments)
 
         def size():
             return abs(frame["poly", 0]) + frame["falls"] + frame["rises"]
 
-        least, largest = size() < small, size() > 1 / small
+        least, largest = size() < SMALL, size() > 1 / SMALL
         with code.only_if(code.any_lane(least | largest)):
-            times = code.select(least, 1 / small**2, code.select(largest, small**2, 1.0))
+            times = code.select(least, 1 / SMALL**2, code.select(largest, SMALL**2, 1.0))
             self.stretch(frame, frame.arguments[0], 1.0, times)
             self.sum_up(frame, *frame.arguments)
         frame["unsure"] = (ROOT_NOISE * EPS) * size()

@@ -50,7 +50,7 @@ class Saltation:
 
         Both do where L jumps, those of a velocity where its acceleration does by more than rounding. Then, where a cone
         is left: from there tangents across it follow its direction at a rate without a bound, they are not known.
-        At a border that is grazed, as by what begins to move there, that of one coordinate is rounding beside others.
+        At a border that is grazed, as by what begins to move there, that of one coordinate may be rounding of others.
         """
         code, guards = frame.code, self.table.borders.guards
         kicks = lost = frame.constant(0.0) > 0.0

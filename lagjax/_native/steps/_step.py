@@ -73,7 +73,7 @@ class StepControl:
     # ---- the size of a step ----
 
     def choose(self, frame: Frame, order: Value) -> None:
-        """The step of every lane, into `h`: 0, and a code, where it cannot go on."""
+        """The step of every lane, into `h`: 0, and a code, where it cannot continue."""
         code = frame.code
         with code.only_if(code.any_lane(code.compare("==", frame["steps"], 0.0))):
             frame.call(self.size_start, order)
@@ -222,7 +222,7 @@ class StepControl:
 
     def _noise(self, frame: Frame, acceleration, increments, moved) -> Callable[[Index], Value]:
         """The part of component i of an acceleration that rounding may leave at a place of the step."""
-        code, n, form, digits = frame.code, self.motion.n, self.motion.form, frame.digits
+        code, n, form = frame.code, self.motion.n, self.motion.form
 
         def size_of(numbers):
             return lambda i: abs(numbers[i])
@@ -230,12 +230,12 @@ class StepControl:
         size = form.largest_by_group(frame, size_of(acceleration), self.error_groups)
         # Half a unit in the last place of q moves an acceleration by what it varies along the step, in proportion.
         place, moves = (form.largest(code, size_of(numbers), n) for numbers in (moved, increments))
-        unit = digits.unit * place / moves
-        unit = code.select(unit < digits.largest_unit, unit, 0.0)  # what hardly moves is not what makes it vary
+        unit = limits.UNIT * place / moves
+        unit = code.select(unit < limits.LARGEST_UNIT, unit, 0.0)  # what hardly moves is not what makes it vary
 
         def noise(i):
             change = abs(acceleration[i] - frame["y", i + n, 1])
-            return digits.round_off * size[i] + unit * change
+            return limits.ROUND_OFF * size[i] + unit * change
 
         return noise
 

@@ -24,8 +24,8 @@ from lagjax._program import Affine, Borders, Level
 # The fields of a thread's memory that say where watches end a step.
 END_OF_STEP: Fields = {
     "planned": 1,  # the step without borders
-    "nearest": 1,  # the first border, as a part of it
-    "seen": 1,  # up to which part of the step all guards can be seen
+    "nearest": 1,  # the first border, as a fraction of it
+    "seen": 1,  # the fraction of the step up to which all guards can be seen
     "first_at": 1,  # how far from the beginning of the step the first change of a guard is
     "event": 1,  # 0 where changes of guards end the motion, −1 without any
 }

@@ -21,11 +21,13 @@ import numpy as np
 from lagjax._engine import Batch, Problem
 from lagjax._engine.taylor import MachineCode, line_of
 from lagjax._equations import ROUNDINGS, derivation_of, has_constraints, require_consistent
-from lagjax._interface import Layout, compile_for_one_call, halves, is_concrete, require_budget, result_from
+from lagjax._interface import Layout, compile_for_one_call, halves, require_budget, result_from
 from lagjax._run._trajectory import (
+    EACH,
     ContactChanges,
     Impacts,
     Names,
+    RunSettings,
     State,
     Trajectory,
     follow_in_doubles,
@@ -44,6 +46,7 @@ from lagjax._run.contacts._contact_motion import (
     slots_of,
 )
 from lagjax._run.contacts._contact_search import find_start_width
+from lagjax._run.jumps import tolerances_of
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes, System, require_coefficients
 
 CHANGES = 1024  # the budget of changes of a motion whose crossings are asked for; what they record takes memory
@@ -62,12 +65,12 @@ def follow_contacts(given: Problem, problem: Problem, max_transitions: int | Non
 
 
 def _follow_at_once(plan: ContactPlan, problem: Problem) -> Trajectory:
-    return _put_on_device(_trajectory(problem, problem, *_motion(plan, problem), None))
+    return _put_on_device(_trajectory(problem, problem, *_motion(plan, problem), None, plan.max_transitions))
 
 
 @compile_for_one_call  # outside of `jit` one program, and not one an operation
 def _follow_compiled(plan: ContactPlan, problem: Problem) -> Trajectory:
-    return _trajectory(problem, problem, *_motion(plan, problem), problem.params)
+    return _trajectory(problem, problem, *_motion(plan, problem), problem.params, plan.max_transitions)
 
 
 def _put_on_device(trajectory: Trajectory) -> Trajectory:
@@ -78,13 +81,13 @@ def _put_on_device(trajectory: Trajectory) -> Trajectory:
 
 def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int | None, params, params_axes) -> Trajectory:
     """The motions of a batch whose system has contacts."""
-    plan, *_ = _plan(batch.member, max_transitions)
+    plan, *_ = _plan(batch.whole, max_transitions)
     if batch.is_known:
-        found = follow_rows(functools.partial(follow_known, plan), batch.member, batch.y0, batch.vectors)
+        found = follow_rows(functools.partial(follow_known, plan), batch.member, batch.ts, batch.y0, batch.vectors)
     else:
         found = batch.map_members(lambda problem: follow_in_doubles(functools.partial(contact_motion, plan), problem))
     ending, record, impacts = found
-    trajectory = _trajectory(given.member, batch.member, ending, record, impacts, None, params_axes)
+    trajectory = _trajectory(given.whole, batch.whole, ending, record, impacts, None, plan.max_transitions, params_axes)
     return dataclasses.replace(_put_on_device(trajectory), params=params)
 
 
@@ -115,14 +118,8 @@ def _plan(problem: Problem, max_transitions: int | None) -> tuple[ContactPlan, P
     """
     max_transitions = 256 if max_transitions is None else max_transitions
     require_budget(max_transitions, "max_transitions")
-    if not all(map(is_concrete, problem.tolerances)):
-        raise ValueError("rtol and atol of a scene with contacts must be numbers: they decide the order of the method.")
-    if is_concrete(problem.ts) and np.asarray(problem.ts)[-1] < np.asarray(problem.ts)[0]:
-        raise ValueError("A scene with contacts goes forward in time: an impact cannot be undone; ts must increase.")
+    tolerances, scene = tolerances_of(problem, "a scene with contacts", "an impact"), ContactScene(problem.system)
     wide = problem.double_precision if problem.is_single else problem
-    rtol, atol = float(MachineCode().rtol(wide)), problem.tolerances[1]
-    limits = rtol, None if atol is None else float(atol), problem.max_steps, max_transitions, problem.is_single
-    scene = ContactScene(problem.system)
     with jax.enable_x64(True):
         shapes = Shapes.from_system(problem.system, wide.layout, wide.params)
         r, d = shapes.rough.size, shapes.directions
@@ -142,7 +139,7 @@ def _plan(problem: Problem, max_transitions: int | None) -> tuple[ContactPlan, P
             holds = Problem.from_system(scene, wide.layout, inside)
         if refusal := MachineCode().refuses(free) or holds.derivation.lowered.accelerations.lacks:
             raise ValueError(f"A scene with contacts needs machine code, and has none: {refusal}.")
-        plan, lowered = ContactPlan(scene, *limits), closed.derivation.lowered
+        plan, lowered = ContactPlan(scene, tolerances, max_transitions, problem.is_single), closed.derivation.lowered
         rows = RowPlaces.from_derivation(lowered, flat).normal[shapes.of_gaps :]
         stays = [not moves.any() for moves in ~lowered.absent("jacobian")[rows]]
         for name, still in zip(shapes.names[shapes.of_gaps :], stays, strict=True):
@@ -186,18 +183,26 @@ def _require_open(problem: Problem, closed: Problem, free: Problem) -> None:
 
 
 def _trajectory(
-    given: Problem, problem: Problem, ending: ContactEnding, record: RoundRecord, impacts, params, axes=None
+    given: Problem,
+    problem: Problem,
+    ending: ContactEnding,
+    record: RoundRecord,
+    impacts,
+    params,
+    budget: int,
+    axes=EACH,
 ) -> Trajectory:
     restore = problem.layout.restore
     (q, qdot), end, (at, behind) = (tuple(map(restore, halves(y))) for y in (ending.path, ending.y, record.y_next))
     before = restore(record.qdot)
     known = record.contact, record.change, ending.rounds, ending.doubts, ending.doubted, record.impulse
     names = Shapes.from_system(problem.system, problem.layout, problem.params).names
+    settings = RunSettings.from_problem(given, MachineCode(), max_transitions=budget)
     changes = ContactChanges(record.t, at, before, at, behind, *known, Names(names))
     return Trajectory(
         ts=jnp.asarray(given.ts), q=q, qdot=qdot, result=result_from(ending.result), end=State(ending.t, *end),
         stats=step_counts(*ending.steps), system=given.system, params=params, params_axes=axes,
-        tolerances=MachineCode().tolerances(problem, problem.y0), engine="MachineCode", impacts=Impacts(*impacts),
+        tolerances=MachineCode().tolerances(problem, problem.y0), settings=settings, impacts=Impacts(*impacts),
         contacts=ending.of_path, contact_changes=changes, contact_names=names,
     )  # fmt: skip
 
@@ -205,7 +210,7 @@ def _trajectory(
 def contact_forces(trajectory: Trajectory, name: str):
     """At every output the `multipliers` of constraints, `constraint_force`, or the normal `contact_forces`, by name.
 
-    NaN where the motion did not come to.
+    NaN where the motion did not arrive.
     """
     system = trajectory.system
     assert isinstance(system, System)

@@ -22,19 +22,19 @@ from lagjax._engine.taylor import (
 )
 from lagjax._equations import Derivation, derivation_of, forms
 from lagjax._interface import Function, Layout, compile_for_one_call, halves
-from lagjax._primitives import attach_derivative, lost_unless
 from lagjax._program import Unlowerable
 from lagjax._run.contacts._contact_search import LOOPS
 from lagjax._run.contacts._corners import append_sides, corners_of
-from lagjax._run.contacts._places import ARRAYS, PLACES, sizes_of
+from lagjax._run.contacts._impact_law import construct_impulses
+from lagjax._run.contacts._places import ARRAYS, PLACES
 from lagjax._run.contacts._replay import ContactReplay, Played
-from lagjax._run.jumps import Found, JumpLaw, Mode, SceneCode
+from lagjax._run.jumps import Found, JumpLaw, Mode, SceneCode, mask_rows
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes
 from lagjax._tracing import Program, compose, lower
 
 PyTree = Any
 
-LAW = JumpLaw(PLACES, LOOPS, sizes_of, ("RESTITUTION", "MU"), ("DOUBTS", "DOUBTED"))
+LAW = JumpLaw(PLACES, LOOPS, ("RESTITUTION", "MU"), ("DOUBTS", "DOUBTED"))
 LAWS = "simultaneous", "sequential", "poisson"
 # Operations that have a series everywhere, which hides nothing.
 _SEEN = frozenset(("input", "constant", "convert", "add", "sub", "mul", "neg", "sin", "cos", "exp", "tanh"))
@@ -47,9 +47,7 @@ class ContactPlan(eqx.Module):
     """
 
     scene: ContactScene
-    rtol: float = eqx.field(static=True)
-    atol: float | None = eqx.field(static=True)
-    max_steps: int = eqx.field(static=True)
+    tolerances: Tolerances = eqx.field(static=True)
     max_transitions: int = eqx.field(static=True)
     is_single: bool = eqx.field(static=True)
     sections: tuple[Function, ...] = ()
@@ -85,19 +83,14 @@ class RoundRecord(NamedTuple):
 
 
 class SearchedScene(NamedTuple):
-    """A scene that has been made ready: its search, its replay, its functions in flat coordinates.
+    """A scene that has been made ready: its replay, and its functions in flat coordinates.
 
-    `coefficients` are e and μ, (k + r,), or their program of the numbers of params; None where they have none.
+    `coefficients` is the program of e and μ, (k + r,), of the numbers of params; None where they have none.
     """
 
-    code: SceneCode
     replay: ContactReplay
     flat: Flat
-    coefficients: np.ndarray | Program | None
-
-    def split_coefficients(self, values):
-        """e (…, k) and μ (…, r) of the coefficients (…, k + r)."""
-        return values[..., : self.code.sizes["K"]], values[..., self.code.sizes["K"] :]
+    coefficients: Program | None
 
 
 @compile_for_one_call
@@ -109,42 +102,28 @@ def contact_motion(
     Those are their times, the normal impulses, the energy that was lost, and their count.
     """
     ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
-    numbers, still = eqx.filter(params, eqx.is_array_like), jax.lax.stop_gradient
-    scene = scene_of(plan, layout, params, len(ts))
-    vector = vector_of(numbers).astype(float)
-    if scene.coefficients is None:
-        coefficients = scene.flat.restitution(numbers), scene.flat.friction(numbers)
-    elif isinstance(scene.coefficients, Program):
-        coefficients = scene.split_coefficients(line_of(scene.coefficients)(vector))
-    else:
-        coefficients = map(jnp.asarray, scene.split_coefficients(scene.coefficients))
-    restitution, friction = coefficients
-    given = ts, y0, vector, restitution, friction
-    found = scene.code.search(*still(given))
-    row, played = _read(scene, found)
-    played = Played(*attach_derivative(scene.replay, tuple(played), *given))
-    return _arrange(scene, found, row, played, given[:3])
+    numbers, scene = eqx.filter(params, eqx.is_array_like), scene_of(plan, layout, params, len(ts))
+    given = ts, y0, vector_of(numbers).astype(float), scene.flat.restitution(numbers), scene.flat.friction(numbers)
+    return _arrange(scene, *scene.replay.follow(*given), given[:3])
 
 
 def follow_known(plan: ContactPlan, layout: Layout, params: PyTree, ts, y0, vectors) -> tuple:
-    """The motions of members whose numbers are known, with members in front: `y0` (N, 2n), `vectors` (N or 1, P).
+    """The motions of members whose numbers are known, with members in front: `y0` (N, 2n), `ts` (N or 1, T), `vectors`
+    (N or 1, P).
 
     `params` are those of one member. There is room for as many changes as there were.
     """
-    scene, members = scene_of(plan, layout, params, len(ts)), len(y0)
+    scene, members = scene_of(plan, layout, params, ts.shape[1]), len(y0)
     vectors = np.broadcast_to(np.asarray(vectors, float), (members, np.shape(vectors)[-1]))
     if scene.coefficients is None:
         rows = [_coefficients_at(scene.flat, params, vector) for vector in vectors]
         coefficients = [np.stack(column) for column in zip(*rows, strict=True)]
-    elif isinstance(scene.coefficients, Program):
-        values = scene.coefficients.evaluate_many(list(vectors.T))
-        coefficients = scene.split_coefficients(np.stack([np.broadcast_to(x, members) for x in values], axis=-1))
     else:
-        values = scene.split_coefficients(scene.coefficients)
-        coefficients = [np.broadcast_to(x, (members, x.size)) for x in values]
-    found = scene.code.run(np.asarray(ts, float)[None], np.asarray(y0, float), vectors, *coefficients, room=None)
-    row, played = _read(scene, found)
-    return _arrange(scene, found, row, played, ())
+        values = [np.broadcast_to(x, members) for x in scene.coefficients.evaluate_many(list(vectors.T))]
+        coefficients = np.split(np.stack(values, axis=-1), [scene.flat.shapes.count], axis=1)
+    code, given = scene.replay.code, (np.asarray(ts, float), np.asarray(y0, float), vectors)
+    found = code.run(*given, *coefficients, room=None)
+    return _arrange(scene, found, *scene.replay.read(found), ())
 
 
 def _coefficients_at(flat: Flat, params: PyTree, vector) -> list[np.ndarray]:
@@ -155,38 +134,28 @@ def _coefficients_at(flat: Flat, params: PyTree, vector) -> list[np.ndarray]:
     return [np.asarray(flat.restitution(given)), np.asarray(flat.friction(given))]
 
 
-def _read(scene: SearchedScene, found: Found) -> tuple[Any, Played]:
-    n = scene.code.sizes["N"]
-    row = scene.code.read(found.record[..., : scene.code.width(PLACES.said)], PLACES.said)
-    t, y = found.ending[..., 0], found.ending[..., 1 : 2 * n + 1]
-    return row, Played(found.path, row.at, row.before, row.behind, row.t_impact, row.impulse, row.lost, t, y)
-
-
 def _arrange(scene: SearchedScene, found: Found, row, played: Played, inputs: tuple) -> tuple:
     """The ending, the changes, and the impacts in front; of what varies with `inputs`, if it is traced."""
     library: Any = jnp if inputs else np
 
-    def lost(there, x):
-        there = there[(..., *[None] * (x.ndim - there.ndim))]
-        return lost_unless(there, x, inputs) if inputs else np.where(there, x, np.nan)
-
-    k, r, d = (scene.code.sizes[name] for name in "KRD")
+    code = scene.replay.code
+    k, r, d = (code.sizes[name] for name in "KRD")
     happened, hits = row.happens > 0, row.hits > 0
-    ends = [k, k + r, k + r + r * d, scene.code.sizes["DOING"] - 1]
+    ends = [k, k + r, k + r + r * d, code.sizes["DOING"] - 1]
     closed, sticks, direction, held, near = library.split(found.did, ends, axis=-1)
     of_path = Contacts(closed, sticks, direction.reshape(*direction.shape[:-1], r, d), held, near[..., 0])
-    of = scene.code.read_ending(found.ending)
+    of = code.read_ending(found.ending)
     result, rounds, accepted, rejected = (x.astype(int) for x in of[:4])
     ending = ContactEnding(
-        lost((closed >= 0).all(axis=-1), played.path), of_path, played.t, played.y, result, rounds,
+        mask_rows((closed >= 0).all(axis=-1), played.path, inputs), of_path, played.t, played.y, result, rounds,
         (accepted, rejected), of.doubts.astype(int), of.doubted,
     )  # fmt: skip
-    changes = (lost(happened, x) for x in (played.at, played.before, played.behind, played.impulse))
+    changes = (mask_rows(happened, x, inputs) for x in (played.at, played.before, played.behind, played.impulse))
     kinds = (library.where(happened, x, -1).astype(int) for x in (row.contact, row.change))
     impacts, front = [], library.argsort(~hits, axis=-1, stable=True)
     for x in (played.t_impact, played.impulse, played.lost):
         places = front[(..., *[None] * (x.ndim - hits.ndim))]
-        impacts.append(library.take_along_axis(lost(hits, x), places, axis=hits.ndim - 1))
+        impacts.append(library.take_along_axis(mask_rows(hits, x, inputs), places, axis=hits.ndim - 1))
     t_impact, impulse, energy = impacts
     return (
         ending,
@@ -209,9 +178,8 @@ def scene_of(plan: ContactPlan, layout: Layout, params: PyTree, times: int) -> S
         for of in (plan.scene, ContactScene(system, is_open=True), ContactScene(system))
     )
     code, structure = jax.tree.flatten(eqx.filter(inside, eqx.is_array_like, inverse=True))
-    tolerances = Tolerances(plan.rtol, plan.atol or 0.0, plan.max_steps)
     given = plan.max_transitions, plan.is_single, plan.sections, plan.directions, tuple(code), structure, times
-    return _make_scene(closed, other, whole, plan.scene, tolerances, *given)
+    return _make_scene(closed, other, whole, plan.scene, plan.tolerances, *given)
 
 
 @functools.lru_cache(maxsize=64)
@@ -238,6 +206,8 @@ def _make_scene(
     bends = response.select_outputs(range(len(response.line.outputs))[-len(places.all) :][:k])
     acceleration = line_of((open_derivation if corners is None else derivation).accelerations.program, n)
     lines = {"RESPONSE": line_of(response), "BENDS": line_of(bends).with_derivative, "ACCELERATION": acceleration}
+    if scene.system.impacts == "poisson" and r:
+        lines["CONSTRUCT"] = line_of(lower(_construct, jax.ShapeDtypeStruct((8,), float)))
     if corners is not None:
         lines["SIDES"] = line_of(corners.sides)
         lines["SIDE_SLOPES"] = lines["SIDES"].forward
@@ -254,18 +224,19 @@ def _make_scene(
     arrays = dict(zip(ARRAYS, (flat.rough, tangential, touch), strict=True))
     searched = SceneCode(LAW, sizes, arrays, modes, lines, tolerances)
     flow = functools.cache(functools.partial(make_flow, derivation, scene.path, None))
-    return SearchedScene(
-        searched, ContactReplay(searched, flow), flat, _lower_coefficients(flat, derivation.numbers.params)
-    )
+    return SearchedScene(ContactReplay(searched, flow), flat, _lower_coefficients(flat, derivation.numbers.params))
 
 
-def _lower_coefficients(flat: Flat, numbers: PyTree) -> np.ndarray | Program | None:
+def _construct(x):
+    """Routh's construction of the coupling (2, 2) and rates (2,) of a contact, then e and μ."""
+    return construct_impulses(x[:4].reshape(2, 2), x[4:6], x[6:7], x[7:])
+
+
+def _lower_coefficients(flat: Flat, numbers: PyTree) -> Program | None:
     try:
-        program = lower(lambda p: jnp.concatenate([flat.restitution(p), flat.friction(p)]), numbers)
+        return lower(lambda p: jnp.concatenate([flat.restitution(p), flat.friction(p)]), numbers)
     except Unlowerable:
         return None
-    constants = [program.constant(i) for i in range(len(program.line.outputs))]
-    return program if None in constants else np.array(constants, float)
 
 
 def _flat_of(derivation: Derivation, scene: ContactScene, structure, code: tuple) -> Flat:
@@ -289,8 +260,8 @@ def held_size(shapes: Shapes, n: int) -> int:
 def slots_of(whole: Derivation, flat: Flat) -> tuple[int, int] | None:
     """The most independent rows of gaps, and of velocities, that hold at once; None to hold all rows as they are.
 
-    They are ranks at states that nothing speaks for, where rows have no corners. The slips of few contacts may hold
-    more beside their gaps than those of all do: all sets are looked at whose gaps leave some rank.
+    They are ranks at random states, where rows have no corners. The slips of few contacts may hold
+    more in addition to their gaps than those of all do: all sets are looked at whose gaps leave some rank.
     """
     places, shapes, n = RowPlaces.from_derivation(whole, flat), flat.shapes, whole.layout.size
     if not held_size(shapes, n) or shapes.count > flat.gap_count or corners_of(whole, places.all, shapes) is not None:

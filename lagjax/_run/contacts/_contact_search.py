@@ -424,8 +424,8 @@ def finish(
 
     `fell` (G,) says which watches fell or rose, if it is an `event`; `result` is that of a run without one.
     """
-    n, k, total, times, x = scene.n, scene.k, scene.watches, scene.times, member.x
-    row, doing = record[int(member.rounds) * scene.row :], scene.doing
+    n, k, total, x = scene.n, scene.k, scene.watches, member.x
+    row = record[int(member.rounds) * scene.row :]
     deciding, start, begun = total - scene.sections, x[2 * n], x[2 * n + 1 + scene.numbers :]
     for i in range(scene.row):
         row[i] = 0.0
@@ -433,7 +433,7 @@ def finish(
     for g in range(deciding):
         decides = decides or (happens and fell[g] > 0)
     if not happens and result == SUCCESSFUL:
-        t_end = ts[times - 1]
+        t_end = ts[scene.times - 1]
     at_once = t_end == start
     write_outputs(scene, ts, start, t_end, found[2 * n :], begun, path, did)
     if decides:
@@ -445,7 +445,7 @@ def finish(
     row.end, row.watch, row.crosses = t_end, float(first), float(crosses)
     row.happens, row.decides = float(happens), float(decides)
     row.ran, row.t_impact = 1.0, MISSING
-    copy(begun, row.did, doing)
+    copy(begun, row.did, scene.doing)
     if crosses or not happens:
         copy(y_end, x, 2 * n)
         x[2 * n] = t_end
@@ -462,17 +462,24 @@ def finish(
         member.came[first - deciding] = 2.0 * fell[first] - 3.0
         row.contact, row.change = float(k + first - deciding), -1.0
     copy(x, row.behind, 2 * n)
-    if scene.corners > 0 and happens:  # time itself may go beyond its corner
-        for j in range(times):
-            if ts[j] <= x[2 * n] and did[j * doing] < 0:
-                copy(x, path[j * 2 * n :], 2 * n)
-                copy(row.did, did[j * doing :], doing)
+    if scene.corners > 0 and happens:
+        write_passed_outputs(scene, member, ts, path, did, row)
     member.rounds += float(happens)
     member.rows += 1.0
     reached = find_result(scene, member, reached, happens)
     member.result = float(reached)
     if reached == SUCCESSFUL:
         check_outputs(scene, member, ts, path, did, room)
+
+
+@loop
+def write_passed_outputs(scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, row: Entry):
+    """Put the outputs at which a motion is that continues beyond a corner, also of time."""
+    n, x, doing = scene.n, member.x, scene.doing
+    for j in range(scene.times):
+        if ts[j] <= x[2 * n] and did[j * doing] < 0:
+            copy(x, path[j * 2 * n :], 2 * n)
+            copy(row.did, did[j * doing :], doing)
 
 
 @loop
@@ -552,7 +559,7 @@ def find_first(scene: Scene, fell: Floats, at_once: bool, did: Floats) -> int:
 
 @loop
 def decide(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> int:
-    """The result behind watch `first`, which fell: state and contacts of the member go on there, as the row says."""
+    """The result behind watch `first`, which fell: the member continues from there, as the row says."""
     n, k, r, x, meets, opening = scene.n, scene.k, scene.r, member.x, row.meets, room.opening
     closed = x[2 * n + 1 + scene.numbers :]
     copy(closed, room.closed, k)
@@ -633,7 +640,7 @@ def note_changes(scene: Scene, member: Member, first: int, hits: bool, row: Entr
 
 @loop
 def meet_corners(scene: Scene, member: Member, first: int, meets: Floats, room: Room) -> int:
-    """Put which contacts come to a corner where watch `first` fell, and open there; the state and time go beyond it.
+    """Put which contacts reach a corner where watch `first` fell, and open there; state and time continue beyond it.
 
     Returns 2 where one is struck at its corner, or stays there, 1 where one meets behind its corner, else 0.
     """
@@ -813,9 +820,9 @@ def find_change(scene: Scene, member: Member, hits: bool, row: Entry, room: Room
         stuck[c] = (1.0 - stuck[c]) * push[rough[c]] if hits else 0.0  # from here on those that slide
     add_rates(rates, coupling, impulses, room.apart, size)
     for j in range(n):
-        room.change[j] = 0.0
+        room.jump[j] = 0.0
         for i in range(size):
-            room.change[j] += impulses[i] * room.responses[i * n + j]
+            room.jump[j] += impulses[i] * room.responses[i * n + j]
     return wrong
 
 
@@ -835,7 +842,12 @@ def ask_rates(scene: Scene, member: Member, hits: bool, row: Entry, room: Room):
         for i in range(k):
             targets[i] = -e[i] * room.rates[i]
     elif scene.r > 0:
-        construct(e[0], member.mu[0], room.coupling, room.rates, targets, row.direction)
+        x = room.free
+        copy(room.coupling, x, 4)
+        copy(room.rates, x[4:], 2)
+        x[6], x[7] = e[0], member.mu[0]
+        evaluate(scene.construct, x, x[8:])
+        targets[0], row.direction[0] = x[8], x[9]
 
 
 @loop
@@ -856,32 +868,6 @@ def is_violated(scene: Scene, member: Member, row: Entry, room: Room) -> bool:
         if flags[i] > 0:
             return True
     return False
-
-
-@loop
-def construct(e: float, mu: float, coupling: Floats, rates: Floats, target: Floats, direction: Floats):
-    """Put the rate behind an impact of one contact in a plane, and −F/μΛ, by Routh's construction.
-
-    As the normal impulse Λ grows, friction acts against the slip of that moment. Where that has stopped the contact
-    sticks, if friction suffices, or slides on the other way. Compression ends where the rate is zero, the impact at
-    1 + e times its impulse (Wang & Mason, J. Appl. Mech. 59 (1992) 635).
-    """
-    normal, mixed, tangential, rate, slip = coupling[0], coupling[1], coupling[3], rates[0], rates[1]
-    side = -1.0 if slip < 0 else 1.0
-    slows = mu * tangential - side * mixed  # of the slip, by Λ; it is positive where friction could jam
-    stops = INFINITY
-    if slip == 0 or slows > 0:
-        stops = abs(slip) / (slows if slows > 0 else 1.0)
-    held = min(max(mixed / tangential, -mu), mu)  # −dF/dΛ from there on
-    slope, then = normal - mu * side * mixed, normal - held * mixed
-    compression = -rate / slope
-    if not slope * stops >= -rate:  # the slip ends before compression does
-        compression = stops + (-rate - slope * stops) / then
-    impulse = (1.0 + e) * compression
-    slides = min(impulse, stops)
-    force = -mu * side * slides - held * (impulse - slides)
-    target[0] = rate + normal * impulse + mixed * force
-    direction[0] = -force / (mu * impulse) if mu * impulse > 0 else 0.0
 
 
 @loop
@@ -951,7 +937,7 @@ def stay_closed(scene: Scene, member: Member, hits: bool, room: Room):
             return
     copy(member.opened, x, scene.inputs)
     for j in range(n):
-        x[n + j] += room.change[j]
+        x[n + j] += room.jump[j]
     evaluate(scene.response, x, behind)
     bends = behind[2 * k * n + k * k + 2 * k :]
     find_pattern(
@@ -974,7 +960,7 @@ def rub(scene: Scene, member: Member, first: int, hits: bool, room: Room):
     if first >= k and first < k + r and was_stuck[first - k] > 0:
         write_held_force(scene, member, first - k, v, room)
     for j in range(n):
-        v[j] = x[n + j] + room.change[j]
+        v[j] = x[n + j] + room.jump[j]
     measure_slips(scene, member, apart, v, behind, room)
     lasts = member.longest if member.longest > 0 else member.last - member.first
     for c in range(r):
@@ -1044,7 +1030,7 @@ def move(scene: Scene, member: Member, first: int, meets: Floats, row: Entry, ro
     """
     n, k, size, x = scene.n, scene.k, scene.k + scene.r * scene.d, member.x
     responses, coupling, largest = room.responses, room.coupling, member.largest
-    offset, change, lost = row.offset, room.change, 0.0
+    offset, change, lost = row.offset, room.jump, 0.0
     for i in range(size):
         for j in range(n):
             part = room.impulses[i] * room.gradients[i * n + j]
@@ -1083,7 +1069,7 @@ def note_force_noise(scene: Scene, member: Member, first: int, room: Room):
     for i in range(scene.k):
         own, fast = room.coupling[i * (scene.k + scene.r * scene.d) + i], 0.0
         for j in range(n):
-            fast += abs(room.gradients[i * n + j]) * max(abs(x[n + j]), abs(x[n + j] + room.change[j]))
+            fast += abs(room.gradients[i * n + j]) * max(abs(x[n + j]), abs(x[n + j] + room.jump[j]))
         if longest > 0:
             least = FORCELESS * (fast / own) / longest
             values[total + i] = max(values[total + i], least)

@@ -120,15 +120,15 @@ def rates_behind(rows: ImpactRows, compressed, returned, restitution):
     return rates + rows.coupling @ phase(rates, returned)
 
 
-def construct_impulses(rows: ImpactRows, restitution, coefficients) -> tuple[Any, Any]:
+def construct_impulses(coupling, rates, restitution, coefficients) -> tuple[Any, Any]:
     """The rate (1,) behind an impact of one contact in a plane, and −F/μΛ (1, 1), by Routh's construction.
 
     As the normal impulse Λ grows, friction acts against the slip of that moment. Where that has stopped the contact
     sticks, if friction suffices, or slides on the other way. Compression ends where the rate is zero, the impact at
     1 + e times its impulse (Wang & Mason, J. Appl. Mech. 59 (1992) 635).
     """
-    (normal, mixed), (_, tangential) = rows.coupling
-    (rate, slip), most = rows.rates, coefficients[0]
+    (normal, mixed), (_, tangential) = coupling
+    (rate, slip), most = rates, coefficients[0]
     side = jnp.where(slip < 0, -1.0, 1.0)
     slows = most * tangential - side * mixed  # of the slip, by Λ; it is positive where friction could jam
     stops = jnp.where((slip == 0) | (slows > 0), jnp.abs(slip) / jnp.where(slows > 0, slows, 1.0), jnp.inf)

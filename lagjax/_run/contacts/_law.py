@@ -9,9 +9,9 @@ from math import atan2, cos, sin, sqrt
 from lagjax._native import Floats, Wholes, loop
 
 EPS = 2.0**-52
-# What is left of a pivot, as a part of it, for a row to depend on those before it: as in `_equations._linear`.
+# A row depends on those before it if no more than this fraction of its pivot is left (as in `_equations._linear`).
 DEPENDENT = EPS ** (2 / 3)
-# By how much of the largest velocity a solution may miss an inequality: some thousand roundings of a solved system.
+# The fraction of the largest velocity by which a solution may miss an inequality: a thousand roundings of a system.
 MISSES = 1e-11
 # What is zero in a tableau whose numbers are of one: some thousand roundings.
 SMALL_PIVOT, TINY = 1e-12, 1e-300
@@ -19,7 +19,7 @@ SMALL_PIVOT, TINY = 1e-12, 1e-300
 PIVOTS = 16
 # Steps of Newton's method, of which there are some four, and the turn, an angle, below which they end.
 TURNS, ALIGNED = 30, 1e-9
-LINKED = 1e-14  # a coupling, as a part of what two contacts respond to their own impulses, that is none
+LINKED = 1e-14  # a coupling, as a fraction of what two contacts respond to their own impulses, that is none
 
 
 @loop

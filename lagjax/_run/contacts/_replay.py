@@ -44,6 +44,8 @@ class Played(NamedTuple):
 class ContactReplay(Replay):
     """The replay of a scene with contacts; `flow` makes the flow of all contacts without watches."""
 
+    played = Played
+
     def __init__(self, code: SceneCode, flow: Callable):
         n, k = code.sizes["N"], code.sizes["K"]
         self._flow, self._lines = flow, code.lines
@@ -120,7 +122,7 @@ class ContactReplay(Replay):
         v = halves(y)[1]
         direction = row.direction.reshape(-1, self.sizes["D"])
         if self.sizes["LAW"] == POISSON and self._rough.size:
-            bounced, along = construct_impulses(rows, restitution, friction)
+            bounced, along = construct_impulses(rows.coupling, rows.rates, restitution, friction)
             direction = jnp.where(hits, along, direction)
         elif self.sizes["LAW"] == POISSON:
             bounced = rates_behind(rows, row.compressed, row.returned, restitution)

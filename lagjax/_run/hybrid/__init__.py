@@ -33,6 +33,7 @@ from lagjax._interface import (
     result_from,
 )
 from lagjax._run._trajectory import (
+    RunSettings,
     Trajectory,
     follow_in_doubles,
     follow_in_numbers,
@@ -42,6 +43,7 @@ from lagjax._run._trajectory import (
 from lagjax._run.hybrid._mode import Transition
 from lagjax._run.hybrid._transition_motion import HybridPlan, follow_known, hybrid_motion
 from lagjax._run.hybrid._transition_search import IN_ONE_PLACE
+from lagjax._run.jumps import tolerances_of
 from lagjax._scene import System, present_system, require_system
 
 PyTree = Any
@@ -57,7 +59,7 @@ class Hybrid:
     - `modes`: a `System` for each name; all share the structure of `q0` and `params`.
     - `transitions`: from which mode to which, and where. The earliest transition happens; of several at one instant,
       the first in the list. After it the same law holds as at the start (see `Transition`): guards that are at zero
-      to rounding and go on in their direction follow at once, as do blows along a row of balls that touch, and those
+      to rounding and continue in their direction follow at once, as do blows along a row of balls that touch, and those
       that are beyond it. What a stretch knows the next one remembers: from which side a guard comes that the reset has
       not moved, and that one without a reset has been crossed.
     - `start`: the name of the mode in which every motion begins, or its place in `modes`: an integer, which may be
@@ -77,9 +79,9 @@ class Hybrid:
     `jax.vmap`, `jax.jit` and `jax.grad` work around it, and every member of a batch switches at its own time. Times and
     states of transitions have first and second derivatives with respect to the initial state and params; third
     derivatives are not right. Of several transitions at one instant they are those in the order in which these
-    happened: where resets do not commute, or the start touches a guard, derivatives from the other side are others. The
-    time at which a guard jumps through zero is not varied, nor is that of a transition whose guard is beyond zero where
-    its mode begins, against that beginning.
+    happened: where resets do not commute, or the start touches a guard, derivatives from the other side are different.
+    The time at which a guard jumps through zero is not varied, nor is that of a transition whose guard is beyond zero
+    where its mode begins, against that beginning.
 
     A guard is examined along the whole of every step, and a step is shortened until the guard is smooth there: a guard
     that touches zero, or crosses it and comes back between two steps, is resolved. A reset to a state off the
@@ -142,26 +144,24 @@ def follow_modes(
     modes, start = scene.modes, scene.first
     first = first_law(scene)
     problem = Problem.from_arguments(first, layout, q0, qdot0, ts, params, rtol, atol, max_steps)
-    if not all(map(is_concrete, problem.tolerances)):
-        raise ValueError("rtol and atol of a lagjax.Hybrid must be numbers: they decide the order of the method.")
-    if is_concrete(problem.ts) and np.asarray(problem.ts)[-1] < np.asarray(problem.ts)[0]:
-        raise ValueError("A lagjax.Hybrid moves forward in time: a reset cannot be undone; ts must increase.")
+    tolerances = tolerances_of(problem, "a lagjax.Hybrid", "a reset")
     q0, qdot0 = as_arrays((q0, qdot0), layout.dtype, "state")
     if is_concrete(start):
         require_consistent(first, layout, problem.ts, q0, qdot0, problem.params)
-    rtol, atol = float(MachineCode().rtol(problem.double_precision)), None if atol is None else float(atol)
-    limits = scene.max_transitions, rtol, atol, max_steps, problem.is_single
+    limits = scene.max_transitions, tolerances, problem.is_single
     plan = HybridPlan(tuple(modes), tuple(modes.values()), tuple(scene.transitions), *limits)
     if problem.is_known and is_concrete(start):
         found = jax.device_put(follow_in_numbers(functools.partial(follow_known, plan), problem, start))
     else:
         found = follow_in_doubles(functools.partial(hybrid_motion, plan), problem, start)
     known = dataclasses.replace(problem, ts=jax.lax.stop_gradient(problem.ts))
+    more = {"max_transitions": scene.max_transitions, "transitions": tuple(scene.transitions)}
     trajectory = Trajectory(
         ts=jnp.asarray(problem.ts), q=found.path[0], qdot=found.path[1], result=result_from(found.result),
         end=found.end, stats=step_counts(*found.steps), system=dict(modes), params=problem.params, mode=found.modes,
         transitions=found.transitions, mode_names=tuple(modes),
         tolerances=MachineCode().tolerances(known, jax.lax.stop_gradient(problem.y0)),
+        settings=RunSettings.from_problem(problem, MachineCode(), **more),
     )  # fmt: skip
     return _raise_unless_ok(modes, trajectory, layout, found.mode) if throw else trajectory
 
@@ -180,7 +180,7 @@ def _raise_unless_ok(modes: dict[str, System], trajectory: Trajectory, layout: L
 
 
 def _why_stopped(trajectory: Trajectory, layout: Layout) -> str | None:
-    """Words for what its transitions came to; None where the result says it."""
+    """A sentence that says why its transitions ended it; None where the result says it."""
     changes, names, modes = trajectory.transitions, trajectory.mode_names, trajectory.system
     assert changes is not None and isinstance(modes, dict)
     end, count = trajectory.end, int(changes.count)
@@ -206,7 +206,7 @@ def _why_stopped(trajectory: Trajectory, layout: Layout) -> str | None:
 
 
 def _last_transitions(trajectory: Trajectory) -> str:
-    """A sentence that names the transitions that go on for ever, where they do."""
+    """A sentence that names transitions that repeat without end; empty without any."""
     changes, names = trajectory.transitions, trajectory.mode_names
     assert changes is not None
     if trajectory.result not in (RESULTS.zeno, RESULTS.transitions_in_turn) or not int(changes.count):

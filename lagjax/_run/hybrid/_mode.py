@@ -42,12 +42,12 @@ class Transition(eqx.Module):
       not rounding. Give contacts a direction.
     - `reset(q, qdot)` → (q, qdot): the state after the transition; it may also ask for `t` and `params`. None keeps it.
       It runs in machine code: `linalg.solve` is possible, a loop whose end depends on the state, or `eigh`, is not.
-    - `fires`: what happens where the guard is beyond zero in its direction when the mode begins, at the start or
-      behind a transition. "beyond": it happens at once. "crossing": it waits until the guard has come back and crosses.
-      None decides by the target. To another mode, beyond zero is where `source` ends: at once, whatever the rate. Back
-      into its own mode it is a blow if its reset turns the guard round, or puts it back: at once where the guard goes
-      on; where it comes back it is let out, which `Transitions.let_out` and `health` say. A section, or a kick that
-      leaves the guard to go on, waits.
+    - `fires`: what happens where the guard is beyond zero in its direction when the mode begins, at the start or behind
+      a transition. "beyond": it happens at once. "crossing": it waits until the guard has come back and crosses. None
+      decides by the target. To another mode, beyond zero is where `source` ends: at once, whatever the rate. Back into
+      its own mode it is a blow if its reset turns the guard round, or puts it back: at once where the guard continues;
+      where it comes back it is let out, which `Transitions.let_out` and `health` say. A section, or a kick after which
+      the guard continues, waits.
 
     Raises `TypeError` or `ValueError` for names, guards and directions that are invalid.
 
@@ -160,16 +160,15 @@ def make_mode(name: str, transitions: tuple[Transition, ...], problem: Problem) 
     """A mode that is ready to run. Raises `ValueError` where it has no machine code."""
     leaving = {k: transition for k, transition in enumerate(transitions) if transition.source == name}
     code, structure = jax.tree.flatten(eqx.filter(problem.params, eqx.is_array_like, inverse=True))
-    of_guards = problem.derivation.lowered, problem.system, tuple(leaving.values()), tuple(code), structure
+    given = tuple(leaving.values()), tuple(code), structure, tuple(leaving), problem.is_rounded
     try:
         if refusal := MachineCode().refuses(problem):
             raise Unlowerable(refusal)
-        surfaces = _surfaces(*of_guards)
-        surfaces = surfaces and surfaces._replace(is_rounded=problem.is_rounded)
-        guarded = dataclasses.replace(problem, guards=surfaces and surfaces.guards(remembers=True))
+        parts = _make_parts(problem.derivation.lowered, problem.system, *given)
+        guarded = dataclasses.replace(problem, guards=parts.surfaces and parts.surfaces.guards(remembers=True))
         if refusal := MachineCode().refuses(guarded):
             raise Unlowerable(refusal)
-        return _make_parts(*of_guards, tuple(leaving), problem.is_rounded)
+        return parts
     except Unlowerable as why:
         raise ValueError(f"The mode {name!r} has no machine code: {why}.") from None
 
@@ -183,7 +182,6 @@ def _make_parts(derivation: Derivation, system: System, leaving, code, structure
     return ModeParts(derivation, system, of, surfaces, lambda numbers: eqx.combine(numbers, others), is_rounded)
 
 
-@functools.lru_cache(maxsize=64)
 def _surfaces(derivation: Derivation, system: System, leaving: tuple, code: tuple, structure) -> Surfaces | None:
     """The guards of the transitions that leave a mode, lowered once; None where none leaves."""
     # `code` and `structure` are what params hold that is not a number. Raises `Unlowerable`.

@@ -15,18 +15,17 @@ import numpy as np
 from lagjax._engine import Problem
 from lagjax._engine.taylor import Tolerances, vector_of
 from lagjax._interface import Layout, compile_for_one_call, halves
-from lagjax._primitives import attach_derivative, lost_unless
 from lagjax._run._trajectory import State, Transitions
 from lagjax._run.hybrid._mode import FIRES, ModeParts, Transition, make_mode
-from lagjax._run.hybrid._transition_places import PLACES, sizes_of
+from lagjax._run.hybrid._transition_places import PLACES
 from lagjax._run.hybrid._transition_replay import HybridReplay, PlayedModes
 from lagjax._run.hybrid._transition_search import LOOPS
-from lagjax._run.jumps import Found, JumpLaw, Mode, SceneCode
+from lagjax._run.jumps import Found, JumpLaw, Mode, SceneCode, mask_rows
 from lagjax._scene import System
 
 PyTree = Any
 
-LAW = JumpLaw(PLACES, LOOPS, sizes_of, ("MODE",), ("LET_OUT", "MODE"))
+LAW = JumpLaw(PLACES, LOOPS, ("MODE",), ("LET_OUT", "MODE"))
 
 
 class HybridPlan(eqx.Module):
@@ -36,9 +35,7 @@ class HybridPlan(eqx.Module):
     systems: tuple[System, ...]
     transitions: tuple[Transition, ...]
     max_transitions: int = eqx.field(static=True)
-    rtol: float = eqx.field(static=True)
-    atol: float | None = eqx.field(static=True)
-    max_steps: int = eqx.field(static=True)
+    tolerances: Tolerances = eqx.field(static=True)
     is_single: bool = eqx.field(static=True)  # whether the start came in float32
 
 
@@ -54,54 +51,33 @@ class Ending(NamedTuple):
     transitions: Transitions
 
 
-class SearchedModes(NamedTuple):
-    """A scene that has been made ready: its search, its replay."""
-
-    code: SceneCode
-    replay: HybridReplay
-
-
 @compile_for_one_call
 def hybrid_motion(plan: HybridPlan, layout: Layout, ts, y0, params: PyTree, start) -> Ending:
     """The motion from y0 (2n,) at ts[0] in the mode of place `start`, and its `max_transitions` transitions."""
-    ts, y0, still = jnp.asarray(ts), jnp.asarray(y0), jax.lax.stop_gradient
-    scene = scene_of(plan, layout, params, len(ts))
+    ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
+    replay = replay_of(plan, layout, params, len(ts))
     vector = vector_of(eqx.filter(params, eqx.is_array_like)).astype(float)
-    given = ts, y0, vector, still(jnp.asarray(start, float))[None]
-    found = scene.code.search(*still(given))
-    row, played = _read(scene, found)
-    played = PlayedModes(*attach_derivative(scene.replay, tuple(played), *given))
-    return _arrange(plan, layout, scene, found, row, played, given[:3])
+    given = ts, y0, vector, jax.lax.stop_gradient(jnp.asarray(start, float))[None]
+    return _arrange(plan, layout, replay, *replay.follow(*given), given[:3])
 
 
 def follow_known(plan: HybridPlan, layout: Layout, params: PyTree, ts, y0, vectors, start) -> Ending:
-    """The motions of members whose numbers are known, with members in front: `y0` (N, 2n), `vectors` (N, P).
+    """The motions of members whose numbers are known, with members in front: `y0` (N, 2n), `ts` (N or 1, T),
+    `vectors` (N, P).
 
     `params` are those of one member; all begin in the mode of place `start`.
     """
-    scene, starts = scene_of(plan, layout, params, len(ts)), np.full((len(y0), 1), float(start))
-    given = (np.asarray(x, float) for x in (ts[None], y0, vectors))
-    found = scene.code.run(*given, starts, room=plan.max_transitions + 1)
-    row, played = _read(scene, found)
-    return _arrange(plan, layout, scene, found, row, played, ())
-
-
-def _read(scene: SearchedModes, found: Found) -> tuple[Any, PlayedModes]:
-    n = scene.code.sizes["N"]
-    row = scene.code.read(found.record[..., : scene.code.width(PLACES.said)], PLACES.said)
-    t, y = found.ending[..., 0], found.ending[..., 1 : 2 * n + 1]
-    return row, PlayedModes(found.path, row.at, row.before, row.behind, t, y)
+    replay, starts = replay_of(plan, layout, params, ts.shape[1]), np.full((len(y0), 1), float(start))
+    given = (np.asarray(x, float) for x in (ts, y0, vectors))
+    found = replay.code.run(*given, starts, room=plan.max_transitions + 1)
+    return _arrange(plan, layout, replay, found, *replay.read(found), ())
 
 
 def _arrange(
-    plan: HybridPlan, layout: Layout, scene: SearchedModes, found: Found, row, played: PlayedModes, inputs: tuple
+    plan: HybridPlan, layout: Layout, replay: HybridReplay, found: Found, row, played: PlayedModes, inputs: tuple
 ) -> Ending:
     """The motion as a whole; of what varies with `inputs`, if it is traced."""
     library: Any = jnp if inputs else np
-
-    def lost(there, x):
-        there = there[(..., *[None] * (x.ndim - there.ndim))]
-        return lost_unless(there, x, inputs) if inputs else np.where(there, x, np.nan)
 
     def cut(x):
         return x[(*[slice(None)] * (row.happens.ndim - 1), slice(plan.max_transitions))]
@@ -109,23 +85,27 @@ def _arrange(
     def restore(y):
         return tuple(map(layout.restore, halves(y)))
 
-    modes, of, happened = found.did[..., 0].astype(int), scene.code.read_ending(found.ending), cut(row.happens > 0)
+    modes, of, happened = found.did[..., 0].astype(int), replay.code.read_ending(found.ending), cut(row.happens > 0)
     result, _, accepted, rejected = (x.astype(int) for x in of[:4])
-    in_list = np.argsort(np.concatenate([mode.numbers for mode in scene.replay.parts]))
-    t, before, behind = (lost(happened, cut(x)) for x in (played.at, played.before, played.behind))
+    in_list = np.argsort(np.concatenate([mode.numbers for mode in replay.parts]))
+    t, before, behind = (mask_rows(happened, cut(x), inputs) for x in (played.at, played.before, played.behind))
     kinds = [library.where(happened, cut(x), -1).astype(int) for x in (row.mode[..., 0], row.target, row.number)]
     known = happened.sum(axis=-1), cut(row.order_matters > 0), of.let_out[..., in_list]
     transitions = Transitions._make((t, *restore(before), *kinds, *known, *restore(behind)))
-    end, path = State(played.t, *restore(played.y)), restore(lost(modes >= 0, played.path))
+    end, path = State(played.t, *restore(played.y)), restore(mask_rows(modes >= 0, played.path, inputs))
     return Ending(end, of.mode[..., 0].astype(int), result, path, modes, (accepted, rejected), transitions)
 
 
 # ---- what is made once -----------------------------------------------------------------------------------------------
 
 
-def scene_of(plan: HybridPlan, layout: Layout, params: PyTree, times: int) -> SearchedModes:
-    """The scene for parameters of this structure and a number of outputs. Raises `ValueError` without machine code."""
-    limits = {"rtol": plan.rtol, "atol": plan.atol, "max_steps": plan.max_steps}
+def replay_of(plan: HybridPlan, layout: Layout, params: PyTree, times: int) -> HybridReplay:
+    """The replay of the scene, for parameters of this structure and a number of outputs.
+
+    Raises `ValueError` without machine code.
+    """
+    rtol, atol, max_steps, *_ = plan.tolerances
+    limits = {"rtol": rtol, "atol": atol or None, "max_steps": max_steps}
     made = (Problem.from_system(system, layout, params, **limits) for system in plan.systems)
     problems = [dataclasses.replace(problem, is_rounded=plan.is_single) for problem in made]
     modes = (make_mode(name, plan.transitions, of) for name, of in zip(plan.names, problems, strict=True))
@@ -133,7 +113,7 @@ def scene_of(plan: HybridPlan, layout: Layout, params: PyTree, times: int) -> Se
 
 
 @functools.lru_cache(maxsize=64)
-def _make_scene(plan: HybridPlan, parts: tuple[ModeParts, ...], times: int) -> SearchedModes:
+def _make_scene(plan: HybridPlan, parts: tuple[ModeParts, ...], times: int) -> HybridReplay:
     numbers = [k for mode in parts for k in mode.numbers]
     leaving = [plan.transitions[k] for k in numbers]
     lines = {("RESETS", j): of for j, of in enumerate(of for mode in parts for of in mode.reset_lines) if of}
@@ -151,6 +131,4 @@ def _make_scene(plan: HybridPlan, parts: tuple[ModeParts, ...], times: int) -> S
         "K": len(leaving), "TIMES": times, "DOING": 1, "MOST": plan.max_transitions + 1, "SINGLE": int(plan.is_single),
     }  # fmt: skip
     modes = [Mode(mode.make_guarded, len(mode.numbers), lambda mode=mode: mode.surfaces) for mode in parts]
-    tolerances = Tolerances(plan.rtol, plan.atol or 0.0, plan.max_steps)
-    code = SceneCode(LAW, sizes, arrays, modes, lines, tolerances, first=len(modes))
-    return SearchedModes(code, HybridReplay(code, parts))
+    return HybridReplay(SceneCode(LAW, sizes, arrays, modes, lines, plan.tolerances, first=len(modes)), parts)

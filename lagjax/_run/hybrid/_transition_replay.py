@@ -31,6 +31,8 @@ class PlayedModes(NamedTuple):
 class HybridReplay(Replay):
     """The replay of a hybrid scene, of whose modes it has the `parts`."""
 
+    played = PlayedModes
+
     def __init__(self, code: SceneCode, parts: tuple[ModeParts, ...]):
         self.parts, self.said = parts, 1 + 2 * code.sizes["N"]
         self._resets = [mode.resets() for mode in parts]

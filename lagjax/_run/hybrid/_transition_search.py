@@ -142,7 +142,7 @@ def write_side(scene: Scene, member: Member, mode: int, g: int, room: Room):
 def turns_round(scene: Scene, member: Member, mode: int, g: int, rate: float, room: Room) -> bool:
     """True for a guard whose reset keeps it off its surface: turns it round, or puts it back.
 
-    A kick that leaves it to go on does not, nor does a section without a reset.
+    A kick after which it continues does not, nor does a section without a reset.
     """
     total, j, watches, way = scene.counts[mode], scene.first_of[mode] + g, room.watched, 0.0
     if scene.resets[j] == 0 or scene.way[j] == 0:
@@ -249,8 +249,8 @@ def pass_transition(
 def note_sides(scene: Scene, member: Member, mode: int, room: Room):
     """Note the sides before a reset of the guards of this mode, and their rounding; of others nothing is known.
 
-    A guard that changes comes from the side that it leaves. Another one that is on its surface comes from where it
-    began, if it stays there since or has no rate, and else from where its rate does.
+    Guards that fired: the side they left. Guards on their surface: the side they started on if they have stayed or have
+    no rate; otherwise the side opposite to their rate.
     """
     total, first, watched, fell = scene.counts[mode], scene.first_of[mode], room.watched, room.fell
     for j in range(scene.k):

@@ -93,7 +93,7 @@ def write_outputs(
 def follow(
     scene: Scene, members: int, ts: Floats, path: Floats, did: Floats, record: Entry, memory: Member, room: Room
 ):
-    """Follow members that go on to their ends, or to a stretch that the kernel does not finish (`ASKS`).
+    """Follow members to their ends, or to a stretch that the kernel does not finish (`ASKS`).
 
     `ts` (T,) are the same for all if `scene` has one row of them, or (members, T). Members run side by side: those
     that are going are packed for one call of the kernel, those of each mode apart.

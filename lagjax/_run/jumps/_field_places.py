@@ -1,7 +1,7 @@
 """The places of what a search reads and writes: in its scene, a member's memory, a row of its record, a thread's room.
 
 A scene is a row of integers: first those that are named, then arrays. Of memories, records and rooms it holds at which
-double each field begins. A law declares its own fields behind those that all have.
+double each field begins. A law declares its own fields after those that all have.
 """
 
 from types import SimpleNamespace
@@ -30,51 +30,55 @@ ARRAYS = (
     # doubles of what this leaves behind, of which the last says whether a run is done; its watches.
     "PLANS", "RESTS", "WATCH", "ERRORS", "SLOPES",
 )  # fmt: skip
-MEMORY = (
-    "X",  # the inputs of lines
-    "WIDTHS",  # how far the start, t and the numbers are known, where they came in float32
-    "RTOL", "FIRST", "LAST",  # the first and the last of the output times
-    "BEGUN",  # y and t where it began
-    "GUARDS",  # (5, G), the watches where the stretch begins
-    "RESULT", "ROUNDS", "ROWS", "ACCEPTED", "REJECTED",
-)  # fmt: skip
-WORK = (
-    "FREE",  # for what is not named
-    "ORDER", "JOBS",  # the members whose stretch comes next, and what the kernel is given and gives
-)  # fmt: skip
-RECORD = (
-    "RAN",  # 1 if there was such a stretch
-    "END", "STOP",  # of the stretch, and the state there (2n,)
-    "WATCH", "CROSSES", "DECIDES",
-)  # fmt: skip
-_SCALARS = ("HAPPENS", "RTOL", "FIRST", "LAST", "RESULT", "ROUNDS", "ROWS", "ACCEPTED", "REJECTED",
-            "RAN", "END", "WATCH", "CROSSES", "DECIDES")  # fmt: skip
+# Each field with the count of its doubles, by the sizes; "" is one number.
+MEMORY = {
+    "X": "inputs",  # of lines
+    "WIDTHS": "inputs",  # how far the start, t and the numbers are known, where they came in float32
+    "RTOL": "", "FIRST": "", "LAST": "",  # the first and the last of the output times
+    "BEGUN": "2 * n + 1",  # y and t where it began
+    "GUARDS": "5 * watches",  # where the stretch begins
+    "RESULT": "", "ROUNDS": "", "ROWS": "", "ACCEPTED": "", "REJECTED": "",
+}  # fmt: skip
+WORK = {"ORDER": "0", "JOBS": "0"}  # the members whose stretch comes next, and what the kernel is given and gives
+RECORD = {
+    "RAN": "",  # 1 if there was such a stretch
+    "END": "", "STOP": "2 * n",  # of the stretch, and the state there
+    "WATCH": "", "CROSSES": "", "DECIDES": "",
+}  # fmt: skip
 
 
 class Places:
-    """The places of a law. Of a row of the record `said` is what a user is told.
+    """The places of a law, whose fields stand in dictionaries like those above; of `work` the last is FREE.
 
-    Of each `scalars` of a memory or a row, and `in_room`, there is one double.
+    Of a row of the record `said` is what a user is told.
     """
 
-    def __init__(self, sizes=(), arrays=(), memory=(), work=(), said=(), record=(), scalars=(), in_room=()):
+    def __init__(self, sizes: tuple, arrays: tuple, memory: dict, work: dict, said: dict, record: dict):
         numbers, self.arrays = (*SIZES, *sizes), (*ARRAYS, *arrays)
-        self.memory, self.work, self.said = (*MEMORY, *memory), (*work, *WORK), ("HAPPENS", *said)
-        self.record, self.scalars = (*self.said, *RECORD, *record), {*_SCALARS, *scalars}
+        self.memory, self.work, self.said = MEMORY | memory, work | WORK, {"HAPPENS": ""} | said
+        self.record = self.said | RECORD | record
+        self.fields = self.memory | self.work | self.record
         to_record = [f"TO_{name}" for name in self.record]
         self.names = (*numbers, *self.arrays, *self.memory, *self.work, *to_record)
         self.of = {name: i for i, name in enumerate(self.names)}
         assert len(self.of) == len(self.names), "two fields of one name"
+        kinds = self.memory, self.work, self.record
+        assert all(self.fields[name] == of[name] for of in kinds for name in of), "two counts of one name"
         self.at = SimpleNamespace(**self.of)
         self.structs = {
             "Scene": Struct({x.lower(): self.of[x] for x in (*numbers, *self.arrays)}, _lower(numbers), None),
-            "Member": self._struct(self.memory, self.scalars), "Room": self._struct(self.work, in_room),
-            "Entry": self._struct(self.record, self.scalars, "TO_"),
+            "Member": self._struct(self.memory), "Room": self._struct(self.work),
+            "Entry": self._struct(self.record, "TO_"),
         }  # fmt: skip
 
-    def _struct(self, names: tuple[str, ...], scalars, prefix: str = "") -> Struct:
-        places = {name.lower(): self.of[prefix + name] for name in names}
-        return Struct(places, _lower(name for name in names if name in scalars), "scene")
+    def _struct(self, fields: dict[str, str], prefix: str = "") -> Struct:
+        places = {name.lower(): self.of[prefix + name] for name in fields}
+        return Struct(places, _lower(name for name in fields if not fields[name]), "scene")
+
+    def count_doubles(self, sizes: dict[str, int]) -> dict[str, int]:
+        """The count of doubles in each field of a memory, of the room of a thread and of a row."""
+        known = {name.lower(): size for name, size in sizes.items()}
+        return {name: eval(count or "1", {}, known) for name, count in self.fields.items()}
 
     def write_scene(self, sizes: dict[str, int], arrays: dict[str, np.ndarray], fields: dict[str, int]) -> np.ndarray:
         """The row of integers, without addresses; `fields` are the doubles of each field."""

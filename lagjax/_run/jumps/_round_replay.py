@@ -10,18 +10,26 @@ Its derivatives are those of the motion that the search found; its values are no
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from lagjax._engine.taylor import Line
-from lagjax._primitives import Repetition, differentiable_where
+from lagjax._primitives import Repetition, attach_derivative, differentiable_where, lost_unless
 from lagjax._program import Unlowerable
-from lagjax._run.jumps._scene_code import SceneCode
+from lagjax._run.jumps._scene_code import Found, SceneCode
 from lagjax._tracing import lower
 
 # Operations of the line of the end of a stretch; instead of a longer one NumPy evaluates its parts.
 LONGEST_REPLAYED = 5000
+
+
+def mask_rows(there, x, inputs: tuple):
+    """The numbers of rows, NaN where these are not `there`; and so is what varies with `inputs`, if it is traced."""
+    there = there[(..., *[None] * (x.ndim - there.ndim))]
+    return lost_unless(there, x, inputs) if inputs else np.where(there, x, np.nan)
 
 
 def join(*arrays):
@@ -31,16 +39,36 @@ def join(*arrays):
 class Replay:
     """The replay of a scene, whose search is `code`; it is known by identity.
 
-    A law passes a stretch (`pass_stretch`), and says how many numbers it tells of one, beside the state behind it.
+    A law passes a stretch (`pass_stretch`), and says how many numbers it tells of one, in addition to the state after
+    it. Its `played` are the parts of a motion that have derivatives: the path, fields of rows, and t and y at the end.
     """
 
     said: int  # how many numbers a law tells of a stretch
+    played: type  # a NamedTuple
 
     def __init__(self, code: SceneCode, varying: int):
         states = 2 * code.sizes["N"]
         shapes = ((self.said,), (states,)), ((code.sizes["TIMES"], states),)
         self.code, self.sizes = code, code.sizes
         self._rounds = Repetition(self._play, varying, 2, *shapes)
+
+    def __call__(self, *given) -> tuple:
+        """The parts of `played`, of what a search is given."""
+        raise NotImplementedError
+
+    def follow(self, *given) -> tuple[Found, Any, Any]:
+        """The findings of a search, the rows of its record, and what was played, which has derivatives."""
+        found = self.code.search(*jax.lax.stop_gradient(given))
+        row, played = self.read(found)
+        return found, row, type(played)(*attach_derivative(self, tuple(played), *given))
+
+    def read(self, found: Found) -> tuple[Any, Any]:
+        """The rows of a record, and what was played, without derivatives."""
+        code, states = self.code, 2 * self.sizes["N"]
+        said = code.law.places.said
+        row = code.read(found.record[..., : code.width(said)], said)
+        parts = (getattr(row, name) for name in self.played._fields[1:-2])  # type: ignore[attr-defined]
+        return row, self.played(found.path, *parts, found.ending[..., 0], found.ending[..., 1 : states + 1])
 
     def pass_stretch(self, given: tuple, start: tuple, row, record, ahead, times, event) -> tuple:
         """The outputs (T, 2n), zero where there are none; what is said, the state behind it, and the time then.

@@ -8,7 +8,7 @@ import collections
 import ctypes
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -17,8 +17,9 @@ import numpy as np
 from jax.core import ShapedArray
 from jax.interpreters import mlir
 
-from lagjax._engine.taylor import Line, Surfaces, line_of, rate_errors
-from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL
+from lagjax._engine import Problem
+from lagjax._engine.taylor import Line, MachineCode, Surfaces, Tolerances, line_of, rate_errors
+from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL, is_concrete
 from lagjax._native import LARGEST_LINE, SINGLE_NOISE, LineCode, Loop, compile_loops, cores, handler
 from lagjax._primitives import LinearMap, call_host, compute_on_host
 from lagjax._run.jumps._driver import ASKS, GOING, NEW
@@ -29,24 +30,29 @@ _ROOM = 32  # rows of a record, at first
 _ROUNDS = 10**6  # of a kernel, for a stretch: beyond that it continues on the host, where it can be interrupted
 
 
-class JumpLaw(NamedTuple):
-    """A law of what happens where a watch falls: `loops` over numbers at `places`; `sizes_of` gives the doubles.
+def tolerances_of(problem: Problem, scene: str, what: str) -> Tolerances:
+    """rtol and atol of a motion that jumps. Raises `ValueError` if they are traced, or the motion goes back in time.
 
-    A search is `given` fields of a member's memory beside the state, and tells those of its `ending`.
+    The errors name the `scene`, and `what` cannot be undone.
+    """
+    if not all(map(is_concrete, problem.tolerances)):
+        raise ValueError(f"rtol and atol of {scene} must be numbers: they decide the order of the method.")
+    if is_concrete(problem.ts) and (np.asarray(problem.ts)[..., -1] < np.asarray(problem.ts)[..., 0]).any():
+        raise ValueError(f"The motion of {scene} goes forward in time: {what} cannot be undone; ts must increase.")
+    wide = problem.double_precision if problem.is_single else problem
+    return Tolerances(float(MachineCode().rtol(wide)), float(problem.tolerances[1] or 0.0), problem.max_steps)
+
+
+class JumpLaw(NamedTuple):
+    """A law of what happens where a watch falls: `loops` over numbers at `places`.
+
+    A search is `given` fields of a member's memory in addition to the state, and tells those of its `ending`.
     """
 
     places: Places
     loops: tuple[Loop, ...]  # those of `bind_law`
-    sizes_of: Callable[[dict[str, int]], dict[str, int]]
     given: tuple[str, ...]
     ending: tuple[str, ...]
-
-    def fields(self, sizes: dict[str, int]) -> dict[str, int]:
-        """The count of doubles in each field of a memory, of the room of a thread and of a row."""
-        n, watches = sizes["N"], sizes["WATCHES"]
-        fields = dict.fromkeys((*self.places.memory, *self.places.work, *self.places.record), 1)
-        fields |= {"X": sizes["INPUTS"], "WIDTHS": sizes["INPUTS"], "BEGUN": 2 * n + 1, "GUARDS": 5 * watches}
-        return fields | {"STOP": 2 * n, "ORDER": 0, "JOBS": 0} | self.sizes_of(sizes)
 
 
 class Mode(NamedTuple):
@@ -89,7 +95,7 @@ class SceneCode:
         self.sizes = sizes | {"MODES": len(modes), "WATCHES": int(counts.max())}
         empty = dict.fromkeys(("WATCH", "ERRORS", "SLOPES"), np.zeros(len(modes)))
         empty |= dict.fromkeys(("PLANS", "RESTS"), np.zeros(2 * len(modes)))
-        self.arrays, self.fields = {"COUNTS": counts, **empty, **arrays}, law.fields(self.sizes)
+        self.arrays, self.fields = {"COUNTS": counts, **empty, **arrays}, law.places.count_doubles(self.sizes)
         self._keep = []  # what the addresses point to
         self.flow_of = functools.cache(lambda mode: modes[mode].make())
         self.scene = functools.cache(self._scene)
@@ -141,17 +147,17 @@ class SceneCode:
             place = self.law.places.of[name] if isinstance(name, str) else scene[self.law.places.of[name[0]]] + name[1]
             scene[place] = address
 
-    def width(self, names: Sequence[str]) -> int:
+    def width(self, names: Collection[str]) -> int:
         """The count of doubles of these fields."""
         return sum(self.fields[name] for name in names)
 
-    def read(self, rows, names: Sequence[str]) -> Any:
+    def read(self, rows, names: Collection[str]) -> Any:
         """The fields of rows (…, doubles) by their names in small letters, those of one double without an axis."""
         ends = np.cumsum([self.fields[name] for name in names])
         parts = [rows[..., end - self.fields[name] : end] for name, end in zip(names, ends, strict=True)]
         of = collections.namedtuple("Rows", [name.lower() for name in names])
-        scalars = self.law.places.scalars
-        return of(*(x[..., 0] if name in scalars else x for name, x in zip(names, parts, strict=True)))
+        counts = self.law.places.fields
+        return of(*(x if counts[name] else x[..., 0] for name, x in zip(names, parts, strict=True)))
 
     def read_ending(self, ending) -> Any:
         """The fields of the `ending` of a search, but for t and y in front."""
@@ -166,7 +172,7 @@ class SceneCode:
         """
         given = map(jnp.asarray, (ts, y0, numbers, *given))
         places = self.law.places
-        return Found(*search_p.bind(*given, code=self, names=places.record if is_replayed else places.said))
+        return Found(*search_p.bind(*given, code=self, names=tuple(places.record if is_replayed else places.said)))
 
     def run(self, ts, y0, numbers, *given, room: int | None) -> Found:
         """`search` on arrays of NumPy with members in front; with no `room` its records are as long as the longest."""

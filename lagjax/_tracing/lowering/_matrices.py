@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from lagjax._primitives import solve_composed
 from lagjax._program import Derivatives, Graph, Unlowerable, copy_nodes, eliminate_dead_code
@@ -205,7 +205,7 @@ def _blocks(expansion: Expansion, matrix: np.ndarray) -> list[tuple[np.ndarray, 
     n, values = len(matrix), [expansion.graph.value(i) for i in matrix.ravel().tolist()]
     links = np.zeros((2 * n, 2 * n), bool)  # of rows with columns
     links[:n, n:] = np.reshape([value != 0 for value in values], matrix.shape)
-    _, labels = connected_components(links, directed=False)
+    _, labels = scipy.sparse.csgraph.connected_components(links, directed=False)
     parts = [labels == k for k in dict.fromkeys(labels[:n].tolist())]
     if any(part[:n].sum() != part[n:].sum() for part in parts):  # singular, whatever the numbers
         parts = [np.ones(2 * n, bool)]

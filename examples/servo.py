@@ -1,0 +1,215 @@
+"""A small servo that swings a mass: the law of its gear box by records that were left out, from its goals alone.
+
+The file holds recordings of a position-controlled servo with a mass on an arm, each with its goal, mass, length and
+gain (Rhoban/bam; the keys are `K_timestamp`, `K_position`, `K_goal_position`, `K_torque_enable`, `K_mass`, `K_length`,
+`K_kp` for K = 0, 1, …). The firmware makes a duty cycle u of the error, and the motor a torque of it:
+
+    (m l² + J) q̈ = τ − m g l sin(q + offset) − friction · sign(q̇)
+    u = clip(e kp (goal − q), −1, 1)        τ = pull u (1 − sag |u|) − brake q̇    while the motor is on
+
+`sag` is what the supply loses under load. The teeth of a gear box press on each other with the motor's torque on one
+side, and the weight on the other, and friction grows with both:
+
+    friction = (dry + a |τ| + b |m g l sin(q + offset)|) (1 + rise exp(−(q̇/slow)²)) + viscous |q̇|
+
+Which of these terms the servo has is chosen by what the law is for: half of the recordings is left out, the law is
+fitted to the other half, and what was left out is simulated from its first sample, with its goal alone; then the halves
+change places. Of the laws that follow as well as the best, within one standard error of the difference over all
+recordings, the simplest is taken.
+
+    python examples/servo.py servo_identification.npz [--law "load, sag"] [--follow OTHER.npz]
+"""
+
+import argparse
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+import lagjax
+
+G = 9.80665  # m/s²
+DUTY = 4096 / (2 * np.pi) / (256 * 885)  # duty cycle over gain and error [1/rad]: the firmware's encoder and scale
+SLOW = 0.5  # rad/s within which dry friction falls
+SPACING = 0.02  # seconds between positions that are fitted
+
+START = {"pull": 1.0, "brake": 0.04, "armature": 1.5e-3, "offset": 0.0, "dry": 0.02}
+MORE = {"viscous": 0.01, "motor": 0.25, "weight": 0.15, "sag": 0.3, "rise": 0.3}
+LAWS = {
+    "dry and viscous": ("viscous",),
+    "load": ("motor", "weight"),
+    "load, sag": ("motor", "weight", "sag"),
+    "load, sag, rise": ("motor", "weight", "sag", "rise"),
+    "load, sag, rise, viscous": ("motor", "weight", "sag", "rise", "viscous"),
+}
+
+
+def push(q, qdot, params, inputs, weight):
+    """The motor's torque less friction [N m]."""
+    duty = jnp.clip(inputs["gain"] * (inputs["goal"] - q), -1.0, 1.0)
+    torque = params["pull"] * duty * (1 - params["sag"] * jnp.abs(duty)) - params["brake"] * qdot
+    torque = inputs["on"] * torque
+    load = params["motor"] * jnp.abs(torque) + params["weight"] * jnp.abs(weight * jnp.sin(q + params["offset"]))
+    dry = (params["dry"] + load) * (1 + params["rise"] * jnp.exp(-((qdot / SLOW) ** 2)))
+    return torque - dry * jnp.sign(qdot) - params["viscous"] * qdot
+
+
+class Recording(NamedTuple):
+    """Times [s], positions [rad] and goals [rad], whether the motor is on, (T,) each; the gain, kg and m."""
+
+    t: np.ndarray
+    q: np.ndarray
+    goal: np.ndarray
+    on: np.ndarray
+    gain: float
+    mass: float
+    length: float
+
+    @property
+    def arm(self) -> str:
+        """The name of what is on the arm, which recordings share."""
+        return f"{self.mass:g} kg at {self.length:g} m"
+
+    @property
+    def inputs(self) -> dict[str, np.ndarray]:
+        """What the firmware is given, (T,) each."""
+        return {"goal": self.goal, "on": self.on, "gain": np.full(len(self.t), self.gain)}
+
+    def scene(self, given=None) -> lagjax.System:
+        """The servo with this arm, whose inputs are those of a record, or the functions of time `given`."""
+        mass, length, weight = self.mass, self.length, self.mass * G * self.length
+
+        def lagrangian(q, qdot, params):
+            inertia = mass * length**2 + params["armature"]
+            return 0.5 * inertia * qdot**2 + weight * jnp.cos(q + params["offset"])
+
+        def forces(q, qdot, params, inputs):
+            return push(q, qdot, params, inputs, weight)
+
+        def timed_forces(q, qdot, t, params):
+            return push(q, qdot, params, {name: u(t) for name, u in given.items()}, weight)
+
+        return lagjax.System(lagrangian, forces=timed_forces if given else forces)
+
+    def record(self) -> lagjax.Record:
+        """What is fitted, from the first position and its rate on."""
+        step = max(1, round(SPACING / np.median(np.diff(self.t))))
+        start = self.q[0], (self.q[step] - self.q[0]) / (self.t[step] - self.t[0])
+        return lagjax.Record(self.t[::step], self.q[::step], inputs=self.inputs, input_ts=self.t, start=start)
+
+    def errors(self, params) -> np.ndarray:
+        """What a simulation from the first sample, with the goal alone, is off by [rad], (T,)."""
+        given = {name: lagjax.samples(self.t, values) for name, values in self.inputs.items()}
+        return np.asarray(lagjax.simulate(self.scene(given), *self.record().start, self.t, params).q) - self.q
+
+
+def recordings(file) -> list[Recording]:
+    """The recordings of a file."""
+    with np.load(file) as data:
+
+        def read(k, *names):
+            return [np.asarray(data[f"{k}_{name}"], float) for name in names]
+
+        found = []
+        while f"{len(found)}_timestamp" in data:
+            t, *signals = read(len(found), "timestamp", "position", "goal_position", "torque_enable")
+            gain, mass, length = map(float, read(len(found), "kp", "mass", "length"))
+            found.append(Recording(t - t[0], *signals, DUTY * gain, mass, length))
+    return found
+
+
+def fit_law(known: list[Recording], more, near=None) -> lagjax.results.Fit:
+    """The fit of one law, begun at the parameters of the fit `near`; terms that it does not name are zero."""
+    first = START | dict.fromkeys(MORE, 0.0) | {name: MORE[name] for name in more}
+    first = first if near is None else near.params
+    free = {name: name in START or name in more for name in first}
+    transforms = {name: lagjax.positive if free[name] and name != "offset" else None for name in first}
+    arms = {one.arm: one.scene() for one in known}
+    records = {arm: [one.record() for one in known if one.arm == arm] for arm in arms}
+    return lagjax.fit(arms, records, first, free=free, transforms=transforms, method="whole")
+
+
+def mean_error(params, one: Recording) -> float:
+    """The mean absolute error [mrad] of a simulated recording."""
+    return 1e3 * float(np.mean(np.abs(one.errors(params))))
+
+
+def left_out(known: list[Recording], more, near) -> list[float]:
+    """The errors of each half, by a law that is fitted to the other half."""
+    errors = np.zeros(len(known))
+    for half in (0, 1):
+        fit = fit_law([one for k, one in enumerate(known) if k % 2 != half], more, near)
+        for k in range(half, len(known), 2):
+            errors[k] = mean_error(fit.params, known[k])
+    return errors.tolist()
+
+
+def chosen(free: list[int], errors: np.ndarray) -> int:
+    """Which law (of errors (laws, recordings)): the simplest within one standard error of the best."""
+    behind = errors - errors[np.argmin(errors.mean(axis=1))]
+    mean, error = behind.mean(axis=1), behind.std(axis=1, ddof=1) / np.sqrt(errors.shape[1])
+    return min(np.flatnonzero(mean <= error).tolist(), key=lambda k: (free[k], mean[k]))
+
+
+def select(known: list[Recording], fits: dict) -> str:
+    """The name of the law that follows what was left out, and the table it was read off."""
+    errors = np.array([left_out(known, LAWS[name], fit) for name, fit in fits.items()])
+    free = [len(fit.u) for fit in fits.values()]
+    print(f"{'law':<34}free  mean  mean absolute error [mrad] of each recording, left out")
+    for name, count, row in zip(fits, free, errors, strict=True):
+        print(f"{name:<34}{count:>4}{row.mean():6.1f}  " + "".join(f"{x:6.0f}" for x in row))
+    name = list(fits)[chosen(free, errors)]
+    print(f"No simpler law follows as well as the best, within one standard error: {name}.\n")
+    return name
+
+
+def draw(known: list[Recording], params, file: Path):
+    """Every recording and its simulation."""
+    rows = -(-len(known) // 2)
+    figure, axes = plt.subplots(rows, 2, figsize=(9.0, 1.6 * rows), sharex=True, squeeze=False)
+    for axis in axes.flat[len(known) :]:
+        axis.set_visible(False)
+    for axis, one in zip(axes.flat, known, strict=False):
+        axis.plot(one.t, one.goal, color="0.8", linewidth=1, label="goal")
+        axis.plot(one.t, one.q, color="0.2", linewidth=2.5, label="measured")
+        axis.plot(one.t, one.q + one.errors(params), color="C1", linewidth=1.2, label="from its goal alone")
+        axis.set_ylabel("angle [rad]")
+        axis.set_title(f"gain {one.gain / DUTY:g}: {mean_error(params, one):.0f} mrad", fontsize=9)
+    axes[0, 0].legend(fontsize=7)
+    for axis in axes[-1]:
+        axis.set_xlabel("time [s]")
+    file.parent.mkdir(exist_ok=True)
+    figure.savefig(file)
+
+
+def main(argv=None):
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("file", type=Path, help="the recordings, an .npz file")
+    parser.add_argument("--law", choices=LAWS, help="take this law without looking at the others")
+    parser.add_argument("--follow", type=Path, help="other recordings of the servo, simulated with what was fitted")
+    options = parser.parse_args(argv)
+    jax.config.update("jax_enable_x64", True)
+    plt.style.use("lagjax.figures")
+
+    known, fits = recordings(options.file), {}
+    for name, more in LAWS.items():
+        if options.law in (None, name):
+            fits[name] = fit_law(known, more)
+    name = options.law or select(known, fits)
+    params = fits[name].params
+    print(f"{name}\n{fits[name]}\n")
+    errors = {}
+    for file, text in ((options.file, "fitted"), (options.follow, "followed")):
+        if file is not None:
+            other = recordings(file)
+            draw(other, params, Path("out") / f"servo_{text}.png")
+            errors[text] = [mean_error(params, one) for one in other]
+            print(f"{text}: {len(other)} recordings, mean absolute error {np.mean(errors[text]):.1f} mrad")
+    return fits, name, errors
+
+
+if __name__ == "__main__":
+    main()

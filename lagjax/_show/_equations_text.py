@@ -1,0 +1,147 @@
+"""The equations of a scene to read: M q̈ = F + Gᵀλ with all numbers by the names that the user gave them."""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lagjax._equations import Derivation, derivation_of
+from lagjax._interface import Layout, number_names, show_str
+from lagjax._program import Formulas, Sum, Unlowerable
+from lagjax._scene import Driven, drive_scene, held_inputs
+from lagjax._show._formula_text import LATEX, PYTHON, FormulaWriter, Name, input_names, shared_parts, short_names
+
+if TYPE_CHECKING:
+    from lagjax._scene import System
+
+PyTree = Any
+
+# Operations of M, F, G and γ that are read: a double pendulum has 40, three links in space 400. Four times as many fill
+# ten pages, and take a second to put together.
+MOST_READ = 500
+_MOST_IN_MATRICES = 4  # coordinates up to which LaTeX shows matrices
+
+
+@dataclass(frozen=True)
+class Equations:
+    """The equations of motion of a scene, M q̈ = F + Gᵀλ with G q̈ = γ, as formulas; `print` shows them all.
+
+    Each formula is Python: with the names of coordinates, velocities (`theta_dot`), `t` and parameters as variables,
+    and the functions of `math`, it evaluates to the number. In a notebook the equations are typeset.
+
+    - `mass_matrix`: M, by the names of two coordinates; `force`: F, by that of one; what is not listed is zero.
+    - `constraints`: what stays zero, by name; `jacobian`: G, by the names of a constraint and a coordinate; `gamma`: γ.
+    - `variables`: the names of q, q̇, t and the numbers of params, in this order.
+    - `parts`: what `x1`, `x2`, … in these formulas stand for, in the order in which they are computed.
+    - `note`: why there are no formulas, where the scene has too many operations for them, or no scalar program.
+    - `latex`: all of it in LaTeX.
+    """
+
+    mass_matrix: dict[tuple[str, str], str] = field(default_factory=dict)
+    force: dict[str, str] = field(default_factory=dict)
+    constraints: dict[str, str] = field(default_factory=dict)
+    jacobian: dict[tuple[str, str], str] = field(default_factory=dict)
+    gamma: dict[str, str] = field(default_factory=dict)
+    parts: dict[str, str] = field(default_factory=dict)
+    variables: tuple[str, ...] = ()
+    note: str = ""
+    latex: str = ""
+
+    _repr_pretty_ = show_str
+
+    def __str__(self) -> str:
+        if self.note:
+            return self.note
+        of = "M q'' = F + G^T lambda, G q'' = gamma" if self.constraints else "M q'' = F"
+        lines = [f"{of}; M is symmetric, and what is not listed is 0.", ""]
+        lines += [f"{name} = {formula}" for name, formula in self.parts.items()]
+        for title, formulas in self._tables().items():
+            lines += [f"{title}[{_key(key)}] = {formula}" for key, formula in formulas.items()]
+        return "\n".join(lines)
+
+    def _tables(self) -> dict[str, dict]:
+        return {
+            "M": self.mass_matrix, "F": self.force, "f": self.constraints, "G": self.jacobian, "gamma": self.gamma,
+        }  # fmt: skip
+
+    def _repr_latex_(self) -> str:
+        return f"$$\n{self.latex}\n$$" if self.latex else self.note
+
+
+def _key(key: str | tuple[str, str]) -> str:
+    return key if isinstance(key, str) else ", ".join(key)
+
+
+def write_equations(system: "System", layout: Layout, params: PyTree, inputs: PyTree) -> Equations:
+    """The result of `System.equations`."""
+    names = system.constraint_names(layout, params) if system.constraints or system.velocity_constraints else []
+    numbers = [*number_names(params, "params"), *number_names(inputs, "inputs")]
+    if inputs is not None:
+        system, params = drive_scene(system, held_inputs), Driven(params, inputs)
+    quantities = ("mass_matrix", "force", "residual", "jacobian", "gamma")
+    try:
+        derivation = derivation_of(system, layout, params).lowered
+        line = derivation.program(*quantities).line
+    except Unlowerable as reason:
+        return Equations(note=f"This scene has no formulas to read: {reason}.")
+    if line.operations > MOST_READ:
+        return Equations(
+            note=f"The equations of this scene take {line.operations} operations, more than the {MOST_READ} that are "
+            "read with profit. system.to_c(q, qdot, params=params) writes all of them in C; system.explain tells what "
+            "they contain."
+        )
+    found = Formulas(line, 2 * layout.size + 1)
+    sums = dict(zip(quantities, _split(derivation, found, quantities), strict=True))
+    return _Page(found, sums, input_names(layout.names, numbers), names).equations()
+
+
+def _split(derivation: Derivation, found: Formulas, quantities: tuple[str, ...]) -> list[np.ndarray]:
+    outputs = np.empty(len(found.outputs), object)
+    outputs[:] = found.outputs
+    return list(derivation.split_outputs(quantities, outputs).values())
+
+
+class _Page:
+    """The formulas of a scene, and how they are written."""
+
+    def __init__(self, formulas: Formulas, sums: dict[str, np.ndarray], names: list[Name], constraints: list[str]):
+        self.sums, self.names, self.constraints = sums, names, short_names(constraints)
+        self.n = len(sums["force"])
+        taken = {name.text for name in names}
+        letter = next(x for x in "xsuzw" if not any(name.startswith(x) and name[1:].isdigit() for name in taken))
+        shared = shared_parts(formulas, [x for of in sums.values() for x in of.ravel()])
+        self.shared = {atom: k + 1 for k, atom in enumerate(shared)}
+        texts = {atom: f"{letter}{k}" for atom, k in self.shared.items()}
+        self.text = FormulaWriter(formulas, names, PYTHON, texts)
+        self.latex = FormulaWriter(formulas, names, LATEX, {a: f"{letter}_{{{k}}}" for a, k in self.shared.items()})
+
+    def equations(self) -> Equations:
+        of, rows = [name.text for name in self.names[: self.n]], self.constraints
+        write = self.text.write
+        matrix, jacobian = self.sums["mass_matrix"], self.sums["jacobian"]
+        each: dict[str, Any] = {
+            "mass_matrix": {(of[i], of[j]): write(matrix[i, j]) for i in range(self.n) for j in range(i, self.n)
+                            if matrix[i, j]},
+            "force": {of[i]: write(x) for i, x in enumerate(self.sums["force"]) if x},
+            "constraints": {rows[i]: write(x) for i, x in enumerate(self.sums["residual"])},
+            "jacobian": {(rows[i], of[j]): write(x) for (i, j), x in np.ndenumerate(jacobian) if x},
+            "gamma": {rows[i]: write(x) for i, x in enumerate(self.sums["gamma"]) if x},
+            "parts": {self.text.parts[atom]: self.text.write_part(atom) for atom in self.shared},
+        }  # fmt: skip
+        return Equations(**each, variables=tuple(name.text for name in self.names), latex=self._write_latex())
+
+    def _write_latex(self) -> str:
+        lines = [rf"{self.latex.parts[atom]} &= {self.latex.write_part(atom)}" for atom in self.shared]
+        shown = {"M": "mass_matrix", "F": "force", "f": "residual", "G": "jacobian", r"\gamma": "gamma"}
+        law = r"M \ddot{q} &= F" + (r" + G^{\mathsf{T}} \lambda, \quad G \ddot{q} = \gamma" if self.constraints else "")
+        for sign, name in shown.items():
+            of = self.sums[name]
+            if of.size and self.n <= _MOST_IN_MATRICES:
+                rows = r" \\ ".join(" & ".join(map(self.latex.write, np.atleast_1d(row))) for row in of)
+                lines.append(rf"{sign} &= \begin{{pmatrix}} {rows} \end{{pmatrix}}")
+            elif of.size:
+                lines += [self._entry(sign, at, x) for at, x in np.ndenumerate(of) if x and at == tuple(sorted(at))]
+        return "\\begin{aligned}\n" + " \\\\\n".join([law, *lines]) + "\n\\end{aligned}"
+
+    def _entry(self, sign: str, at: tuple[int, ...], x: Sum) -> str:
+        return rf"{sign}_{{{' '.join(str(i + 1) for i in at)}}} &= {self.latex.write(x)}"
