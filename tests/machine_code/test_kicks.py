@@ -297,7 +297,7 @@ def test_refused_before_the_run():
     with pytest.raises(ValueError, match="jumps at a border: the velocities jump there"):
         lagjax.simulate(step("where"), -1.0, 1.0, ts, 0.3, solver=diffrax.Tsit5())
     for lagrangian, what in (
-        (lambda q, v: 0.5 * v**2 + jnp.abs(v), "no law says"),
+        (lambda q, v: 0.5 * v**2 + jnp.abs(v), "no law gives"),
         (lambda q, v: -jnp.sqrt(1 - v**2) - jnp.where(q > 0, 0.3, 0.0), "not quadratic in qdot"),
     ):
         with pytest.raises(ValueError, match=what):
