@@ -358,7 +358,7 @@ def test_jumps_that_are_decided_in_several_steps():
     np.testing.assert_allclose(run.qdot[:, 0], [0.0, 0.16, 0.36, 0.5, 0.77, 0.99], rtol=1e-14)
 
 
-@pytest.mark.parametrize("rtol", [1e-6, 1e-11])
+@pytest.mark.parametrize("rtol", [pytest.param(1e-6, marks=pytest.mark.slow), 1e-11])
 def test_a_wire_whose_curvature_jumps_kicks_nothing(rtol):
     """A bead on a table and around its edge, whose gap has a corner at x = 0 elsewhere: against the angle alone."""
     radius, g, duration = 0.05, 9.81, 0.09
