@@ -29,6 +29,7 @@ CALLS, STEPS, MEMBERS = 2000, 1000, 4096
 
 def legs(count: int = 6) -> str:
     """A base with three slides and three turns, and legs of three joints at its rim, as URDF."""
+    limit = '<limit lower="-9" upper="9" effort="9" velocity="9"/>'  # which pinocchio asks of slides
     inertia = '<inertia ixx="0.02" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.015"/>'
 
     def link(name: str, mass: float) -> str:
@@ -38,7 +39,7 @@ def legs(count: int = 6) -> str:
     def joint(kind: str, parent: str, child: str, axis: str, place: str = "0 0 0") -> str:
         return (
             f'<joint name="to_{child}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
-            f'<origin xyz="{place}"/><axis xyz="{axis}"/></joint>'
+            f'<origin xyz="{place}"/><axis xyz="{axis}"/>{limit}</joint>'
         )
 
     parts, carrier = [link("ground", 0.0)], "ground"

@@ -26,6 +26,7 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 
 - `equilibrium`, `steady_motion`, `linearize`, `normal_modes`: at rest or rolling on, and near it: `Equilibrium`,
   `SteadyMotion`, `Linearization` (`ReducedLinearization`), `Modes`
+- `inverse_dynamics`: the forces that an acceleration takes
 - `conserved_quantities`, `noether_charge`, `cyclic_coordinates`: symmetries: `ConservedQuantities`, each `Conserved`
 - `same_motion`: whether two Lagrangians have one motion, as `SameMotion`
 - `change_coordinates`, `hamiltonian`, `routhian`: the scene written otherwise: `ChangedCoordinates`, `Hamiltonian` with
@@ -72,6 +73,7 @@ if TYPE_CHECKING:  # each is imported on first use: all of them take as long as 
         cyclic_coordinates,
         equilibrium,
         hamiltonian,
+        inverse_dynamics,
         linearize,
         noether_charge,
         normal_modes,
@@ -122,9 +124,9 @@ __all__ = [
     "RESULTS", "Clipped", "Delayed", "FineOutput", "Gaussian", "Guess", "Hybrid", "MachineCode", "Quantised", "Record",
     "SimulationError", "Statistics", "Store", "StudentT", "Sweep", "System", "Timings", "Transition", "action", "angle",
     "between", "branch_off", "change_coordinates", "check", "conserved_quantities", "crossings", "cyclic_coordinates",
-    "designs", "equilibrium", "family", "find_path", "fit", "hamiltonian", "inertia", "linearize", "lyapunov_exponent",
-    "lyapunov_spectrum", "noether_charge", "normal_modes", "per_record", "periodic_orbit", "plot", "positive",
-    "results", "routhian", "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch",
+    "designs", "equilibrium", "family", "find_path", "fit", "hamiltonian", "inertia", "inverse_dynamics", "linearize",
+    "lyapunov_exponent", "lyapunov_spectrum", "noether_charge", "normal_modes", "per_record", "periodic_orbit", "plot",
+    "positive", "results", "routhian", "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch",
     "steady_motion", "sweep", "work_precision", "wrapped",
 ]  # fmt: skip
 

@@ -72,8 +72,11 @@ class HeldScene(NamedTuple):
             return jnp.asarray(shares, multipliers.dtype), jnp.asarray(True), ""
         return multipliers, fine, self._opens(pushes, "At the equilibrium that was found")
 
-    def require_loaded(self, q: PyTree, qdot: PyTree, params: PyTree, what: str) -> PyTree:
-        """q, where all that is held presses; else raise `ValueError`, or, where that is being traced, q as NaN."""
+    def require_loaded(self, q: PyTree, qdot: PyTree, params: PyTree, why: str) -> PyTree:
+        """q, where all that is held presses; else raise `ValueError`, or, where that is being traced, q as NaN.
+
+        The error says which contact does not press, and `why` it has to.
+        """
         if not self.places:
             return q
         leaves = jax.tree.leaves(self.system.multipliers(q, _velocities(q, qdot), 0.0, params))
@@ -83,8 +86,7 @@ class HeldScene(NamedTuple):
         if not is_concrete(loaded):
             return jax.tree.map(lambda x: nan_unless(loaded, jnp.asarray(x, float)), q)
         if not loaded:
-            one_side = f"{what} next to a contact without load is linear on one side of it alone."
-            raise ValueError(f"{self._opens(pushes, 'At this state')} {one_side}")
+            raise ValueError(f"{self._opens(pushes, 'At this state')} {why}")
         return q
 
     def _opens(self, pushes, where: str) -> str:
@@ -94,6 +96,10 @@ class HeldScene(NamedTuple):
             f"{where} {name} would have to pull, or carries nothing (its force is {pushes[k]:.6g}): it opens. Begin "
             "where its gap is positive."
         )
+
+
+def one_sided_reason(what: str) -> str:
+    return f"{what} next to a contact without load is linear on one side of it alone."
 
 
 def hold_closed(system: Any, q: PyTree, qdot: PyTree, params: PyTree, what: str) -> HeldScene | None:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax._analysis._closed_contacts import hold_closed
+from lagjax._analysis._closed_contacts import hold_closed, one_sided_reason
 from lagjax._analysis._eigen import tangent_basis
 from lagjax._analysis._equilibrium import least_multipliers
 from lagjax._analysis._scene_state import SceneState, require_matrices
@@ -235,7 +235,7 @@ def linearize(
         inputs = _require_inputs(system, sensor, inputs)
         system, params = drive_scene(system, held_inputs), Driven(params, inputs)
     if held := hold_closed(system, q, qdot, params, "A linearization"):
-        system, q = held.system, held.require_loaded(q, qdot, params, "A motion")
+        system, q = held.system, held.require_loaded(q, qdot, params, one_sided_reason("A motion"))
     scene = SceneState.from_state(system, q, qdot, params)
     scene.require_autonomous("A linearization")
     require_smooth(scene, "A linearization")
@@ -307,8 +307,9 @@ def _linearize(of_inputs: Layout | None, sensor: Function | None, *arguments) ->
     scene = SceneState.from_arguments(*arguments)
     n, state = scene.layout.size, (scene.q, scene.qdot, jnp.zeros((), scene.q.dtype), scene.numbers)
     zero, one = jnp.zeros((n, n), scene.q.dtype), jnp.eye(n, dtype=scene.q.dtype)
-    mass, force = scene.motion.mass_matrix_and_force(*state)
-    constraints = scene.motion.constraints
+    unbalanced, constraints = scene.motion.unbalanced_force, scene.motion.constraints
+    force, mass = jax.linearize(lambda a: -unbalanced(*state[:2], a, *state[2:]), zero[0])
+    mass = -jax.vmap(mass, out_axes=1)(one)
     jacobian, gamma = constraints.jacobian(*state), constraints.gamma(*state)
     if scene.constrained:
         solve = jax.vmap(lambda b, c: saddle(mass, b, jacobian, c)[0], in_axes=1, out_axes=1)
@@ -323,10 +324,10 @@ def _linearize(of_inputs: Layout | None, sensor: Function | None, *arguments) ->
     def balance(q, qdot, u):
         """F + Gᵀλ − M q̈ and γ − G q̈ at fixed q̈ and λ; the constraints and their rates."""
         place = q, qdot, state[2], eqx.filter(_driven_params(of_inputs, scene, u), eqx.is_array_like)
-        mass, force = scene.motion.mass_matrix_and_force(*place)
         jacobian, gamma = constraints.jacobian(*place), constraints.gamma(*place)
         allowed = jnp.concatenate([constraints.f(q, *place[2:]), constraints.rates(*place)])
-        return force + jacobian.T @ multipliers - mass @ acceleration, gamma - jacobian @ acceleration, allowed
+        force = unbalanced(q, qdot, acceleration, *place[2:])
+        return jacobian.T @ multipliers - force, gamma - jacobian @ acceleration, allowed
 
     smooth, of_state = is_smooth(scene), (0, 1) if of_inputs is None else (0, 1, 2)
     u = jnp.zeros(n, one.dtype) if of_inputs is None else of_inputs.flatten(scene.params.inputs)

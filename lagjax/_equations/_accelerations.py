@@ -141,7 +141,8 @@ class Accelerations:
     @lowered_once
     def general(self) -> Program:
         program, mechanics = self._solution(_ACCELERATION), self._mechanics
-        return program if mechanics is None else replace(program, mechanics=mechanics)
+        residual = None if self.motion.constrained or self.of.has_rules else lambda: self.of.unbalanced_force
+        return replace(program, mechanics=mechanics, residual=residual)
 
     @lowered_once
     def _mechanics(self) -> StraightLine | None:

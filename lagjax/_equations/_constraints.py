@@ -126,6 +126,13 @@ def is_inconsistent(motion, state: tuple, span, dtype, terms) -> Bool[Array, ""]
     return ~jnp.all((near | rounded) & (lengths > 0))
 
 
+def exceeds(left: Row, lengths: Row, terms, unit: Vector, *accelerations: Vector) -> Bool[Array, " m"]:
+    """True where what is `left` of G q̈ − γ (m,) is beyond `TOLERANCE` of accelerations (n,) and rounding of `terms`."""
+    dtype = np.dtype(left.dtype)
+    rounding = ROUNDINGS * np.finfo(dtype).eps * rows_of_terms(terms, left.shape)
+    return left > jnp.maximum(TOLERANCE[dtype] * lengths * _size(unit, *accelerations), rounding)
+
+
 def sizes(unit, q, qdot, span):
     """The sizes of q and of q̇, (…) each, with coordinates in their `unit` (…, n), 1/√Mᵢᵢ: the same for all of them.
 

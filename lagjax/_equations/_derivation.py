@@ -26,7 +26,7 @@ from lagjax._equations._coupled_forces import CoupledForces
 from lagjax._equations._form import SCALAR, Form, derived_form, form_in_xla
 from lagjax._equations._motion import Motion
 from lagjax._equations._patterns import gradient_memory, jacobian_pattern
-from lagjax._equations._quantities import OwnRules, quantities
+from lagjax._equations._quantities import OwnRules, quantities, unbalanced_force
 from lagjax._equations._recursion import Recursion
 from lagjax._equations._sparse import MOST_COLORS
 from lagjax._equations._structure import SparseMotion
@@ -175,6 +175,22 @@ class Derivation:
             self.has_rules = True
             return lower(trace_arrays, *leaves, budget=forms.OPERATION_BUDGET, moving=2 * self.layout.size + 1)
 
+    @lowered_once
+    def unbalanced_force(self) -> Program:
+        """`Motion.unbalanced_force`; its last inputs are q̈ (n,)."""
+        if self.form.reason is not None or isinstance(self.motion.forces, CoupledForces):
+            raise Unlowerable(self.form.reason or "forces read multipliers")
+        shapes, moving = (*self.state_shapes, self.state_shapes[0]), 2 * self.layout.size + 1
+        leaves, _ = jax.tree.flatten(shapes)
+
+        def trace_scalars(expansion, leaves):
+            return [unbalanced_force(self.motion, expansion, shapes[:-1], leaves[:-1], expansion.real(leaves[-1]))]
+
+        try:
+            return lower_scalars(trace_scalars, tuple(leaves), forms.OPERATION_BUDGET, moving)
+        except OwnRules:
+            raise Unlowerable("a function has rules of its own for its derivatives") from None
+
     @property
     def recursion(self) -> Recursion | None:
         """The recursion by which L builds velocities, if that is shorter."""
@@ -211,13 +227,17 @@ class Derivation:
         # 0.6 for 0.1 + q0 + 0.2 - q1 - 0.3 at q = 0, where the value, 0 or 6e-17, says nothing.
         state = [q, qdot, t, *jax.tree.leaves(numbers)]
         try:
-            program = self._rounding_of(names, self.program(*names).size)
+            program = self.term_program(names)
         except Unlowerable:
             return 0.0
         if all(map(is_concrete, state)):
             return program.evaluate_many(np.concatenate([np.ravel(x) for x in state]))[:, 0]
         first, *others = map(jnp.ravel, jax.lax.stop_gradient([jnp.concatenate([q, qdot, t[None]]), *state[3:]]))
         return jnp.stack(program.compute_outputs(first, jnp.concatenate(others) if others else ()))
+
+    def term_program(self, names: tuple[str, ...]) -> Program:
+        """The program of the sizes of the terms of these quantities. Raises `Unlowerable`."""
+        return self._rounding_of(names, self.program(*names).size)
 
     def round_off(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:
         """The rounding errors of these quantities at S states that are exact, each of shape (S, …)."""
@@ -327,11 +347,20 @@ class Derivation:
     def differentiates(self) -> bool:
         """True if derivatives are those of programs: no function has rules of its own or looks up a table, and the
         programs are not large."""
+        return self._may_be_differentiated("whole")
+
+    @property
+    def differentiates_force(self) -> bool:
+        """True if those of `unbalanced_force` are."""
+        return self._may_be_differentiated("unbalanced_force")
+
+    def _may_be_differentiated(self, name: str) -> bool:
         try:
-            usual = not (self.whole.looks_up or self.has_rules)
-            return usual and self.layout.dtype == DOUBLE and self.whole.operations <= forms.LARGEST_DIFFERENTIATED
+            program = getattr(self, name)
         except Unlowerable:
             return False
+        usual = not (program.looks_up or self.has_rules)
+        return usual and self.layout.dtype == DOUBLE and program.operations <= forms.LARGEST_DIFFERENTIATED
 
     @property
     def traced_operations(self) -> int:

@@ -76,6 +76,12 @@ class Motion(eqx.Module):
         matrix = self.mass_matrix(q, qdot, t, params)
         return lambda x: matrix @ x
 
+    def unbalanced_force(self, q: Vector, qdot: Vector, qddot: Vector, t: Time, params: PyTree) -> Vector:
+        """M q̈ − F, as dp/dt − ∂L/∂q − Q: the forces that an acceleration takes beside those of the scene."""
+        along = qdot, qddot, jnp.ones_like(t)
+        _, rate = jax.jvp(lambda *state: self.momentum(*state, params), (q, qdot, t), along)
+        return rate - self.generalized_force(q, qdot, t, params)
+
     def energy(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Scalar:
         """h = p·q̇ − L, with dh/dt = −∂L/∂t + Q·q̇ along the motion."""
         return self.momentum(q, qdot, t, params) @ qdot - self.lagrangian(q, qdot, t, params)
@@ -109,6 +115,22 @@ class Motion(eqx.Module):
         """Gᵀλ, the generalised force that the constraints exert."""
         _, pull = self.constraints.products(q, qdot, t, params)
         return pull(self.multipliers(q, qdot, t, params))
+
+    def required_force(
+        self, q: Vector, qdot: Vector, t: Time, params: PyTree, qddot: Vector, terms=0.0
+    ) -> tuple[Vector, Bool[Array, " m"]]:
+        """τ of M q̈ = F + τ + Gᵀλ, the shortest in the metric of M⁻¹, and which constraints q̈ violates.
+
+        `terms` (m,) are the sizes of the terms of γ, of which rounding is left.
+        """
+        state = q, qdot, t, params
+        if not self.constrained:
+            return self.unbalanced_force(q, qdot, qddot, t, params), jnp.zeros(0, bool)
+        # λ of the shortest τ is that of the motion by itself: G M⁻¹τ = 0 leaves both equations as they are.
+        acceleration, unit = self.acceleration(*state), self.unit(*state)
+        left = jnp.abs(self.constraints.products(*state)[0](qddot) - self.constraints.gamma(*state))
+        violates = _constraints.exceeds(left, self.row_lengths(unit, *state), terms, unit, qddot, acceleration)
+        return self.mass_product(*state)(qddot - acceleration), violates
 
     def schur_complement(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Float[Array, "m m"]:
         """G M⁻¹ Gᵀ, or G K⁻¹ Gᵀ of the same rank (see `_linear`): its rank is the number of independent constraints."""

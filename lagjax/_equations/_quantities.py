@@ -137,11 +137,8 @@ def quantities(motion: Motion, expansion: Expansion, shapes: tuple, leaves: list
     rates = {"q": state.ids["qdot"], "t": True}
     lagrangian = state.taped(motion.lagrangian)
     by_q, momentum, by_t, matrix, inertial = _derivatives(state, lagrangian, rates)
-    zero, of_constraints = state.zeros(by_q.shape), _constraint_quantities(motion.constraints, state, rates)
-    dissipation, damping = state.zeros(0), zero
-    if motion.dissipation is not None:
-        taped = state.taped(motion.dissipation)
-        dissipation, (damping,) = taped.value, state.gradient(taped, "qdot")
+    of_constraints = _constraint_quantities(motion.constraints, state, rates)
+    zero, dissipation, damping = _dissipation(motion, state)
     if isinstance(motion.forces, CoupledForces):
         free = state.expansion.map("sub", inertial, damping)
         rows = of_constraints["jacobian"], of_constraints["gamma"]
@@ -159,7 +156,7 @@ def quantities(motion: Motion, expansion: Expansion, shapes: tuple, leaves: list
         "energy_by_q": state.expansion.map("sub", state.rate(by_q, qdot=state.ids["qdot"]), by_q),
         "force": state.expansion.map("add", inertial, nonconservative),
         "given_force": forces,
-        "dissipation": dissipation.reshape(-1),
+        "dissipation": dissipation,
         "dissipation_by_qdot": damping,
         "nonconservative_force": nonconservative,
         "generalized_force": generalized,
@@ -210,6 +207,31 @@ def _entries(state: _ScalarState, recursion: Recursion) -> Ids:
     return np.array([minus if i is None else i for i in recursion.entries.values()])
 
 
+def unbalanced_force(motion: Motion, expansion: Expansion, shapes: tuple, leaves: list, qddot: Ids) -> Ids:
+    """`Motion.unbalanced_force` at an acceleration of ids (n,), as ids. Raises `OwnRules`."""
+    state = _ScalarState(expansion, shapes, leaves)
+    lagrangian = state.taped(motion.lagrangian)
+
+    def derive(together: bool) -> tuple[Ids, Ids]:
+        by_q, momentum = state.gradient(lagrangian, "q", "qdot", together=together)
+        rate = state.rate(momentum, q=state.ids["qdot"], qdot=qddot, t=True)
+        return (force := expansion.map("sub", rate, by_q)), force
+
+    inertial, _ = _derive_shorter(state, lagrangian, derive)
+    _, _, damping = _dissipation(motion, state)
+    given = None if motion.forces is None else state.evaluate(motion.forces, *state.ids)
+    return expansion.map("add", inertial if given is None else expansion.map("sub", inertial, given), damping)
+
+
+def _dissipation(motion: Motion, state: _ScalarState) -> tuple[Ids, Ids, Ids]:
+    """Zeros (n,), the dissipation (1,), or (0,) without one, and its derivatives by q̇ (n,)."""
+    zero = state.zeros(state.ids["q"].shape)
+    if motion.dissipation is None:
+        return zero, state.zeros(0), zero
+    taped = state.taped(motion.dissipation)
+    return zero, taped.value.reshape(-1), state.gradient(taped, "qdot")[0]
+
+
 # Scalars of a tape beyond which cotangents of equal scalars are always taken together: what they would hide is that
 # terms of sums cancel, and sums of many terms are not compared.
 _APART = 5000
@@ -219,22 +241,28 @@ _SHORTER = 0.97
 
 def _derivatives(state: _ScalarState, lagrangian: _Taped, rates: dict) -> tuple[Ids, Ids, Ids, Ids, Ids]:
     """∂L/∂q, p, ∂L/∂t, M, and ∂L/∂q − (∂p/∂q) q̇ − ∂p/∂t, in the form that takes fewer operations."""
-    # In a kinetic energy of rotations the terms of ∂L/∂q cancel with those of (∂p/∂q) q̇. Where the cotangents of equal
-    # scalars are added up at once, that is not seen: where cos q is in the kinetic and in the potential energy, one
-    # term cancels and the other does not. For forces between many bodies to add them up at once is a quarter shorter.
-    forms = []
-    for together in (True, False) if len(lagrangian.tape.nodes) <= _APART else (True,):
+
+    def derive(together: bool) -> tuple[tuple, Ids]:
         by_q, momentum, by_t = state.gradient(lagrangian, "q", "qdot", "t", together=together)
         matrix = state.jacobian(momentum, "qdot")
         i, j = np.nonzero(matrix != state.zeros(()))
         i, j = np.maximum(i, j), np.minimum(i, j)
         matrix[j, i] = matrix[i, j]
         inertial = state.expansion.map("sub", by_q, state.rate(momentum, **rates))
-        forms.append((by_q, momentum, by_t, matrix, inertial))
+        return (by_q, momentum, by_t, matrix, inertial), np.append(_filled(state, matrix), inertial)
+
+    return _derive_shorter(state, lagrangian, derive)[0]
+
+
+def _derive_shorter(state: _ScalarState, lagrangian: _Taped, derive: Callable[[bool], tuple[Any, Ids]]) -> tuple:
+    """A derivation and the scalars that it consists of, by `derive(together)`: the form that takes fewer operations."""
+    # In a kinetic energy of rotations the terms of ∂L/∂q cancel with those of (∂p/∂q) q̇. Where the cotangents of equal
+    # scalars are added up at once, that is not seen: where cos q is in the kinetic and in the potential energy, one
+    # term cancels and the other does not. For forces between many bodies to add them up at once is a quarter shorter.
+    forms = [derive(together) for together in ((True, False) if len(lagrangian.tape.nodes) <= _APART else (True,))]
     if len(forms) == 1:
         return forms[0]
-    both = ([*_filled(state, matrix).tolist(), *inertial.tolist()] for *_, matrix, inertial in forms)
-    sizes = list(map(state.derivatives.size, both))
+    sizes = [state.derivatives.size(ids.tolist()) for _, ids in forms]
     return forms[0] if sizes[0] < _SHORTER * sizes[-1] else forms[-1]
 
 

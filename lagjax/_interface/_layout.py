@@ -32,15 +32,19 @@ class Layout:
     dtype: np.dtype
 
     @classmethod
-    def from_state(cls, q: PyTree, qdot: PyTree) -> "Layout":
-        """Read the layout of a state; raise `TypeError` or `ValueError`, with a sentence, where (q, qdot) is none."""
+    def from_state(cls, q: PyTree, qdot: PyTree, name: str = "qdot") -> "Layout":
+        """Read the layout of a state; raise `TypeError` or `ValueError`, with a sentence, where (q, qdot) is none.
+
+        The rates of q that are given in the place of q̇ have another `name`.
+        """
         paths, tree, shapes, dtypes = _structure(q, "q")
-        _, qdot_tree, qdot_shapes, qdot_dtypes = _structure(qdot, "qdot")
+        _, qdot_tree, qdot_shapes, qdot_dtypes = _structure(qdot, name)
         if tree != qdot_tree:
-            raise ValueError(f"q and qdot must have the same structure; got {tree} for q and {qdot_tree} for qdot.")
+            raise ValueError(f"q and {name} must have the same structure; got {tree} for q and {qdot_tree} for {name}.")
+        rate = "velocity" if name == "qdot" else "acceleration"
         for path, shape, qdot_shape in zip(paths, shapes, qdot_shapes, strict=True):
             if shape != qdot_shape:
-                raise ValueError(f"{path} has shape {shape}, but its velocity has shape {qdot_shape}: they must agree.")
+                raise ValueError(f"{path} has shape {shape}, but its {rate} has shape {qdot_shape}: they must agree.")
         if not sum(math.prod(shape) for shape in shapes):
             raise ValueError("q has no coordinates: it must hold at least one number.")
         dtypes = {*dtypes, *qdot_dtypes}

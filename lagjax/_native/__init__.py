@@ -39,7 +39,7 @@ from lagjax._native.motions._c_lines import CNumbers, write_function
 from lagjax._native.motions._derivative_handler import derivative_handler
 from lagjax._native.motions._handler import Plan, handler, make_once, unavailable
 from lagjax._native.motions._kernel import Begun, Kernel, Steps, cores, floor_of
-from lagjax._native.motions._line_handler import LineCode, compilation_work, line_handler
+from lagjax._native.motions._line_handler import LineCode, compilation_work, line_function, line_handler
 from lagjax._native.series._guards import Guards, append_guards
 from lagjax._native.series._motion_parts import Projection, pieces_of, recurrences
 from lagjax._native.series._taylor import is_large, order_for

@@ -19,7 +19,7 @@ from lagjax._engine import AbstractEngine, Problem
 from lagjax._equations import has_constraints
 from lagjax._interface import ENDED_WELL, RESULTS, Layout, SimulationError, is_concrete, is_known, registered, show_str
 from lagjax._primitives import DOUBLE, compute_in_doubles, marks_absent, raise_where_failed
-from lagjax._scene import System
+from lagjax._scene import System, describe_violation
 
 if TYPE_CHECKING:
     import lagjax
@@ -350,6 +350,37 @@ class Trajectory(eqx.Module):
         name = "constraint_force"
         return self._map_outputs(name) if self.contacts is None else self._forces_in_contact(name)
 
+    def required_forces(self, qddot: PyTree) -> PyTree:
+        """The generalised forces that accelerations along this path take, in the structure of `q`, as its leaves.
+
+        At every output time they are those of `lagjax.inverse_dynamics`; `qddot` has the structure and the shapes of
+        `q`. The motion's own accelerations take none. NaN where `q` is.
+
+        **Raises** `ValueError` for a `qddot` of other shapes, for one that violates a constraint (NaN where values are
+        being traced), and for a motion with contacts.
+
+        ```python
+        import jax.numpy as jnp, lagjax
+
+        pendulum = lagjax.System(lambda q, qdot: 0.5 * qdot**2 + 9.81 * jnp.cos(q))
+        run = lagjax.simulate(pendulum, 1.0, 0.0, jnp.linspace(0.0, 10.0, 101))
+        run.required_forces(jnp.zeros(101))  # 9.81 sin(q): what holds the acceleration at zero
+        ```
+        """
+        if self.contacts is not None:
+            raise ValueError(
+                "required_forces is for motions without contacts, whose share of the forces changes along the way: "
+                "take lagjax.inverse_dynamics at a state, or write contacts that stay closed as constraints=...."
+            )
+        if jax.tree.map(jnp.shape, qddot) != jax.tree.map(jnp.shape, self.q):
+            raise ValueError("qddot must have the structure and the shapes of trajectory.q: a number at every output.")
+        forces, places = self._map_outputs("_required_force", qddot)
+        if is_known(places) and (violated := np.argwhere(np.asarray(places) >= 0)).size:
+            first = tuple(violated[0])
+            t, place = np.broadcast_to(self.ts, places.shape)[first], int(places[first])
+            raise ValueError(f"At t = {t:.6g} {describe_violation(f'number {place} of the multipliers')}")
+        return forces
+
     def constraint_residual(self) -> PyTree:
         """f and a at every output time, in the structure of `multipliers`: the drift off the constraints."""
         return self._map_outputs("constraint_residual")
@@ -468,25 +499,25 @@ class Trajectory(eqx.Module):
             system._require_present()
 
     @marks_absent
-    def _map_outputs(self, name: str) -> PyTree:
-        """Map a method (q, qdot, t, params) of the system over the time axis, and over the batch axes before it."""
+    def _map_outputs(self, name: str, *more: PyTree) -> PyTree:
+        """Map a method (q, qdot, t, params, *more) of the system over time, and over the batch axes before it."""
         self._require_present()
 
-        def evaluate_member(q, qdot, times_and_tolerances, params, mode):
+        def evaluate_member(q, qdot, times_and_tolerances, params, mode, *more):
             evaluate = functools.partial(self._evaluate_output, name, params)
-            return jax.vmap(evaluate)(q, qdot, times_and_tolerances[0], mode)
+            return jax.vmap(evaluate)(q, qdot, times_and_tolerances[0], mode, *more)
 
-        return self.map_members(evaluate_member)
+        return self.map_members(evaluate_member, *more)
 
-    def _evaluate_output(self, name: str, params, q, qdot, t, mode) -> PyTree:
+    def _evaluate_output(self, name: str, params, q, qdot, t, mode, *more) -> PyTree:
         if isinstance(self.system, System):
-            return getattr(self.system, name)(q, qdot, t, params)
-        if name not in ("energy", "momentum"):  # which every mode has
+            return getattr(self.system, name)(q, qdot, t, params, *more)
+        if name not in ("energy", "momentum", "_required_force"):  # which every mode has
             _require_like_constraints(self.system, name, q, qdot, params)
         total = None
         for index, which in enumerate(self.mode_names):
             # Laws of another mode may be singular here: their NaN must not reach a derivative.
-            state = constant_unless(mode == index, (q, qdot, t, params))
+            state = constant_unless(mode == index, (q, qdot, t, params, *more))
             value = getattr(self.system[which], name)(*state)
             total = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), value) if total is None else total
             total = jax.tree.map(lambda new, old, here=mode == index: jnp.where(here, new, old), value, total)

@@ -15,6 +15,8 @@ from lagjax._scene._system import (
     ARGUMENTS,
     ROLES,
     System,
+    Time,
+    describe_violation,
     present_system,
     replace_functions,
     require_coefficients,

@@ -30,7 +30,7 @@ from lagjax._interface import (
     registered,
     require_number,
 )
-from lagjax._primitives import SINGLE, compute_in_doubles
+from lagjax._primitives import SINGLE, compute_in_doubles, nan_unless
 from lagjax._program import Unlowerable, lack_of_memory
 from lagjax._scene._explanation import Explanation, explain
 
@@ -487,23 +487,37 @@ class System(eqx.Module):
                 names += [label + (str(list(index)) if leaf.shape else "") for index in np.ndindex(leaf.shape)]
         return names
 
-    def _evaluate_quantity(self, quantity: Callable, q, qdot, t, params, restore: bool = False):
-        """One of `Motion`'s functions at a state in the user's pytree, back in that pytree where `restore` says so."""
+    def _required_force(self, q: PyTree, qdot: PyTree, t: Time, params: PyTree, qddot: PyTree) -> tuple:
+        """`Motion.required_force` in the structure of `q`, and the place of a constraint that qddot violates, or −1.
+
+        Where it violates one, the forces are NaN.
+        """
+        layout, _ = Layout.from_state(q, qdot), Layout.from_state(q, qddot, "qddot")
+        force, violated = self._evaluate_quantity(Motion.required_force, q, qdot, t, params, qddot=qddot)
+        place = jnp.where(violated.any(), jnp.argmax(violated), -1) if violated.size else jnp.array(-1)
+        return layout.restore(nan_unless(place < 0, force) if violated.size else force), place.astype(float)
+
+    def _evaluate_quantity(self, quantity: Callable, q, qdot, t, params, restore: bool = False, **more: PyTree):
+        """One of `Motion`'s functions at a state in the user's pytree, back in that pytree where `restore` says so.
+
+        It takes `more` pytrees like q.
+        """
         self, layout = present_system(self), Layout.from_state(q, qdot)
         require_number(t, "t")
-        q, qdot, t = as_arrays((q, qdot, 1.0 * t), layout.dtype, "state")
+        q, qdot, t, more = as_arrays((q, qdot, 1.0 * t, more), layout.dtype, "state")
         params = as_arrays(params, layout.dtype)
 
-        def evaluate_at(self, q, qdot, t, params):
+        def evaluate_at(self, q, qdot, t, params, more):
             layout = Layout.from_state(q, qdot)
+            more = {name: layout.flatten(x) for name, x in more.items()}
             value = self._evaluate_program(quantity, layout, q, qdot, t, params)
             if value is None and quantity is Motion.nearest_consistent:
                 numbers, flat = eqx.filter(params, eqx.is_array_like), (layout.flatten(q), layout.flatten(qdot), t)
                 terms = derivation_of(self, layout, params).term_sizes(*flat, numbers)
                 return _evaluate(self, quantity, q, qdot, t, params, terms=terms)
-            return _evaluate(self, quantity, q, qdot, t, params) if value is None else value
+            return _evaluate(self, quantity, q, qdot, t, params, **more) if value is None else value
 
-        given = self, q, qdot, t, params
+        given = self, q, qdot, t, params, more
         # A tracer that a function closes over would be lost in doubles.
         closes = any(f.code.tracers for role in ROLES if isinstance(f := getattr(self, role), Function))
         is_single = layout.dtype == SINGLE and not closes
@@ -566,6 +580,15 @@ class System(eqx.Module):
         trees = self._role_shapes(self._multiplier_roles, layout, params)
         flat = np.zeros(count_numbers(trees), layout.dtype)
         return {"multipliers": jax.eval_shape(lambda x: name_numbers(x, trees), flat)}
+
+
+def describe_violation(constraint: str) -> str:
+    """A sentence for an acceleration that a constraint does not allow."""
+    return (
+        f"qddot violates the constraint {constraint}, so that no force brings it about: q̈ has to satisfy G q̈ = γ. The "
+        "nearest one that does is the acceleration of this System with forces=lambda q, v: tau, where tau = "
+        "inverse_dynamics of the scene without constraints."
+    )
 
 
 def count_numbers(trees: PyTree) -> int:

@@ -171,7 +171,8 @@ class Program:
     of the results. `traced_operations` counts the scalar operations of the function as written. A program that does not
     hold for all inputs says so in its last output, and `otherwise()` is the one for those. Where the outputs are the
     solution of a linear system, `linear` is that. `mechanics` gives what L and the constraints are (`_kick.Mechanics`)
-    from the same inputs, where L or a constraint is piecewise.
+    from the same inputs, where L or a constraint is piecewise. `residual()` is a program that is zero at the solution,
+    its last inputs, by which its derivatives are A.
     """
 
     line: StraightLine
@@ -180,6 +181,7 @@ class Program:
     otherwise: "Callable[[], Program] | None" = None
     linear: LinearSystem | None = None
     mechanics: StraightLine | None = None
+    residual: "Callable[[], Program] | None" = None
 
     @property
     def complete(self) -> "Program":

@@ -17,8 +17,10 @@ operation: derivatives of a motion by its duration compiled for 14 s longer with
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +32,16 @@ from lagjax._engine.taylor._call import NO_HANDLER, capsule
 from lagjax._equations import forms
 from lagjax._native import LARGEST_LINE, LineCode, compilation_work, line_handler, make_once
 from lagjax._primitives import HostFunction, LinearMap, call_host, compute_on_host, is_zero, share_rows
-from lagjax._program import Graph, StraightLine, Unlowerable, copy_nodes, pullback, pushforward
+from lagjax._program import (
+    Graph,
+    LinearSystem,
+    StraightLine,
+    Unlowerable,
+    copy_nodes,
+    eliminate_dead_code,
+    pullback,
+    pushforward,
+)
 from lagjax._tracing import Program, emit, lower, lowers
 
 _TARGET = "lagjax_line"
@@ -60,12 +71,13 @@ def join_columns(*parts):
 
 def line_of(program: Program, count: int | None = None) -> "Line":
     """The first `count` outputs of a program, by default all; other inputs than floats are given as floats."""
-    return _line_of(program.line, count, program.dtypes)
+    return _line_of(program, count)
 
 
 @functools.lru_cache(maxsize=64)
-def _line_of(line: StraightLine, count: int | None, dtypes: tuple[np.dtype, ...]) -> "Line":
-    line = line.replace(outputs=line.outputs[:count])
+def _line_of(program: Program, count: int | None) -> "Line":
+    line, dtypes = program.line.replace(outputs=program.line.outputs[:count]), program.dtypes
+    root, linear = None, program.linear
     if any(dtype.kind != "f" for dtype in dtypes):
         graph, ids = Graph(3 * len(line.nodes) + len(dtypes)), []
         for i, dtype in enumerate(dtypes):
@@ -73,22 +85,68 @@ def _line_of(line: StraightLine, count: int | None, dtypes: tuple[np.dtype, ...]
             ids.append(x if dtype.kind == "f" else graph.apply("convert", x, attribute=dtype.name))
         nodes = copy_nodes(graph, line, ids)
         line = StraightLine(tuple(graph.nodes), tuple(graph.kinds), tuple(nodes[i] for i in line.outputs))
-    return Line(line, len(dtypes), len(dtypes))
+    elif program.residual is not None and linear is not None and not linear.others and count is None:
+        root, line = Root(linear, program.residual), line.replace(outputs=(*line.outputs, *linear.factors))
+    return Line(line, len(dtypes), len(dtypes), root=root)
+
+
+class Root(NamedTuple):
+    """The outputs z of a line but its last, which is constant, as the root of r(x, z) = 0, with ∂r/∂z = A of `linear`.
+
+    A dz = −dr: a derivative of r takes a third of the operations of one of the elimination. Its line takes the outputs
+    and the factors of A, which that of the values leaves, in its stead.
+    """
+
+    linear: LinearSystem
+    residual: Callable[[], Program]
+
+    def derive(self, of: "Line", differentiate: Callable, by: range, linear: int) -> StraightLine:
+        """`differentiate(line, types, by, outputs)`, `pushforward` or `pullback`, from (x, outputs, factors, v)."""
+        n, memo = of.outputs - 1, of.outputs + len(self.linear.factors)
+        of_residual = differentiate(self.residual().line, [np.dtype(float)] * (of.size + n), by, range(n))
+        solve = self.linear.solve()
+        graph = Graph(2 * (len(of_residual.nodes) + len(solve.nodes)) + of.size + memo + linear)
+        x, left, along = _inputs_of(graph, of.size, memo, linear)
+        zero, factors = graph.number(0.0), left[of.outputs :]
+
+        def solve_negative(right: list[int]) -> list[int]:
+            right = [graph.apply("neg", i) for i in right] + [zero] * (len(self.linear.right) - n)
+            return _place_line(graph, solve, [*factors, *right])[:n]
+
+        with np.errstate(all="ignore"):
+            if differentiate is pushforward:
+                found = [*solve_negative(_place_line(graph, of_residual, [*x, *left[:n], *along])), zero]
+            else:
+                found = _place_line(graph, of_residual, [*x, *left[:n], *solve_negative(along[:n])])
+            return eliminate_dead_code(graph, found)
+
+
+def _inputs_of(graph: Graph, *counts: int) -> list[list[int]]:
+    ends = np.cumsum([0, *counts]).tolist()
+    return [[graph.input(i, "float") for i in range(*pair)] for pair in itertools.pairwise(ends)]
+
+
+def _place_line(graph: Graph, line: StraightLine, inputs: list[int]) -> list[int]:
+    """The outputs of a line as nodes of a graph, where it has these inputs."""
+    found = copy_nodes(graph, line, inputs)
+    return [found[i] for i in line.outputs]
 
 
 class Line:
     """A straight line from `size` floats x, with the lines of its derivatives by the first `count`; by identity.
 
     What a line of derivatives is linear in comes after its first `count` inputs. By the first that are `fixed` there
-    are no derivatives.
+    are no derivatives. Where it is the `root` of an equation, they are those of that, and a `memo` of numbers for them
+    comes after the outputs; lines of derivatives take both after x, and what is `plain` does not.
     """
 
-    def __init__(self, line: StraightLine, size: int, count: int, fixed: int = 0):
-        self.line, self.size, self.count, self.fixed, self._calls = line, size, count, fixed, 0
+    def __init__(self, line: StraightLine, size: int, count: int, fixed: int = 0, root: Root | None = None):
+        self.line, self.size, self.count, self.fixed, self.root, self._calls = line, size, count, fixed, root, 0
+        self.memo, self.make_plain = len(root.linear.factors) if root else 0, lambda: self
 
     @property
     def outputs(self) -> int:
-        return len(self.line.outputs)
+        return len(self.line.outputs) - self.memo
 
     @property
     def width(self) -> int:
@@ -96,18 +154,24 @@ class Line:
         return self.count - self.fixed
 
     @functools.cached_property
+    def plain(self) -> "Line":
+        return self.make_plain()
+
+    @functools.cached_property
     def code(self) -> LineCode | None:
         return self._make_code()
 
     @functools.lru_cache(maxsize=2)  # noqa: B019  # those of a few
-    def code_of_jit(self, is_wide: bool) -> LineCode | None:
+    def code_of_jit(self, is_wide: bool, shared: tuple[int, ...] = ()) -> LineCode | None:
         """The code for a program of XLA, which is called often; LLVM may take longer for it."""
-        for lanes in (LANES, 1) if is_wide and self.size + self.outputs <= MOST_IN_LANES else (1,):
+        for lanes in (LANES, 1) if is_wide and self.size + len(self.line.outputs) <= MOST_IN_LANES else (1,):
             if compilation_work(self.line, lanes) <= WORK_OF_JIT:
-                return self._make_code(largest=len(self.line.nodes) + self.outputs, lanes=lanes)
+                return self._make_code(
+                    largest=len(self.line.nodes) + len(self.line.outputs), lanes=lanes, shared=shared
+                )
         return self.code
 
-    def _make_code(self, **settings: int) -> LineCode | None:
+    def _make_code(self, **settings: Any) -> LineCode | None:
         try:
             makes = NO_HANDLER is None and not self.line.looks_up
             return LineCode(self.line, self.size, **settings) if makes else None
@@ -123,7 +187,7 @@ class Line:
         is_short = len(self.line.nodes) <= LARGEST_LINE
         code = self.code if is_short and self._calls >= _CALLS else None
         found = self.line.evaluate(list(rows.T)).T if code is None else code(rows)
-        return found.reshape(*batch, self.outputs)
+        return found.reshape(*batch, self.outputs + self.memo)
 
     @functools.cached_property
     def forward(self) -> "Line":
@@ -138,50 +202,68 @@ class Line:
     @functools.cached_property
     def with_derivative(self) -> "Line":
         """(x, v) ↦ g(x), D(x) v, one behind the other."""
-        line, size = self.forward.line, self.forward.size
+        line, size = self.forward.plain.line, self.forward.plain.size
         graph = Graph(2 * len(line.nodes) + len(self.line.nodes) + size)
-        ids = [graph.input(i, "float") for i in range(size)]
-        copies = [(of, copy_nodes(graph, of, ids[:count])) for of, count in ((self.line, self.size), (line, size))]
-        found = tuple(nodes[i] for of, nodes in copies for i in of.outputs)
+        (ids,) = _inputs_of(graph, size)
+        found = *_place_line(graph, self.line, ids[: self.size])[: self.outputs], *_place_line(graph, line, ids)
         return Line(StraightLine(tuple(graph.nodes), tuple(graph.kinds), found), size, size)
 
     def _derivative(self, differentiate: Callable, linear: int) -> "Line":
         by = range(self.fixed, self.count)
-        line = differentiate(self.line, [np.dtype(float)] * self.size, by, range(self.outputs))
-        return Line(line, self.size + linear, self.size, self.fixed)
+        if self.root is None:
+            line = differentiate(self.line, [np.dtype(float)] * self.size, by, range(self.outputs))
+            return Line(line, self.size + linear, self.size, self.fixed)
+        line = self.root.derive(self, differentiate, by, linear)
+        found = Line(line, self.size + len(self.line.outputs) + linear, self.size, self.fixed)
+
+        def compose() -> Line:
+            graph = Graph(2 * (len(self.line.nodes) + len(line.nodes)) + self.size + linear)
+            x, along = _inputs_of(graph, self.size, linear)
+            outputs = _place_line(graph, line, [*x, *_place_line(graph, self.line, x), *along])
+            return Line(eliminate_dead_code(graph, outputs), self.size + linear, self.size, self.fixed)
+
+        found.make_plain = compose
+        return found
 
     def __call__(self, *parts):
         """g(x) of rows x (…, inputs) in parts (…, some), under every transformation of JAX."""
-        batch = jnp.broadcast_shapes(*(x.shape[:-1] for x in parts))
-        return value_p.bind(*(jnp.broadcast_to(x, (*batch, x.shape[-1])) for x in parts), line=self)[0]
+        rank = max(x.ndim for x in parts)
+        return value_p.bind(*(x.reshape((*[1] * (rank - x.ndim), *x.shape)) for x in parts), line=self)[0]
 
     @functools.lru_cache(maxsize=8)  # noqa: B019  # those of a few
     def vary_first(self, count: int) -> "Line":
         """The line whose derivatives are by the first `count` inputs."""
-        return Line(self.line, self.size, count, min(self.fixed, count))
+        return Line(self.line, self.size, count, min(self.fixed, count), self.root)
 
 
 # ---- primitives ------------------------------------------------------------------------------------------------------
 
 
 class _LineMap(LinearMap):
-    """The line `of(line)` of rows of arrays that stand side by side, with `width(line)` results a row."""
+    """The line `of(line)` of rows of arrays that stand side by side, with results of these `widths(line)` a row.
 
-    def __init__(self, name: str, of: Callable, width: Callable, linear: int = 0, transpose: Callable | None = None):
-        def shape(x, *_, line: Line):
-            return [ShapedArray((*x.shape[:-1], width(line)), np.dtype(float))]
+    Axes of rows broadcast: an array that all rows of an axis share has 1 there.
+    """
 
-        def vary(primals, tangents, _, *, line: Line):
-            by = of(line)
+    def __init__(self, name: str, of: Callable, widths: Callable, linear: int = 0, transpose: Callable | None = None):
+        def shape(*arrays, line: Line):
+            return [ShapedArray((*_rows_of(arrays), width), np.dtype(float)) for width in widths(line) if width]
+
+        def vary(primals, tangents, results, *, line: Line):
+            by = of(line).plain
+            if line.root is not None and linear:  # the derivative of one is by x alone
+                first = len(primals) - linear - 2
+                primals, tangents = [*primals[:first], *primals[first + 2 :]], tangents[:first]
             if len(tangents) > 1:  # parts of x, of which the last ones may stand still
                 moving = 1 + max(i for i, tangent in enumerate(tangents) if not is_zero(tangent))
                 tangents = tangents[:moving]
                 by = by.vary_first(sum(x.shape[-1] for x in primals[:moving]))
-            along = jnp.concatenate(list(map(ad.instantiate_zeros, tangents)), axis=-1)[..., line.fixed :]
-            return forward_p.bind(jnp.concatenate(primals, axis=-1), along, line=by)
+            along = join_columns(*map(ad.instantiate_zeros, tangents))[..., line.fixed :]
+            left = map(jax.lax.stop_gradient, results if by.root is not None else ())
+            return [*forward_p.bind(*primals, *left, along, line=by), *[None] * (len(results) - 1)]
 
         super().__init__(f"lagjax_line_{name}", shape, vary, linear, transpose)
-        self.of, self.shape = of, shape
+        self.of, self.shape, self.widths = of, shape, widths
         compute_on_host(self, self.evaluate)
         lowers(self.name)(self._place)
         mlir.register_lowering(self, self._lower_on_cpu, platform="cpu")
@@ -189,21 +271,26 @@ class _LineMap(LinearMap):
 
     def _place(self, expansion, params: dict, *arrays):
         """Its nodes in the graph of a function that is lowered."""
-        of, batch = self.of(params["line"]), arrays[0].shape[:-1]
-        rows = np.concatenate([expansion.real(x).reshape(math.prod(batch), -1) for x in arrays], axis=1)
+        of, batch = self.of(params["line"]), _rows_of(arrays)
+        arrays = [np.broadcast_to(expansion.real(x), (*batch, x.shape[-1])) for x in arrays]
+        rows = np.concatenate([x.reshape(math.prod(batch), -1) for x in arrays], axis=1)
         expansion.work(len(rows) * len(of.line.nodes))
         nodes = [copy_nodes(expansion.graph, of.line, row.tolist()) for row in rows]
         found = np.array([[of_row[i] for i in of.line.outputs] for of_row in nodes], dtype=np.int64)
-        return [found.reshape(*batch, of.outputs)]
+        return self._split(found.reshape(*batch, -1), params["line"])
+
+    def _split(self, found, line: Line) -> list:
+        ends = np.cumsum([0, *self.widths(line)]).tolist()
+        return [found[..., begin:end] for begin, end in itertools.pairwise(ends)]
 
     def evaluate(self, *arrays, line: Line):
         """By NumPy, or machine code, at once."""
-        return [self.of(line).evaluate(*map(np.asarray, arrays))]
+        return self._split(self.of(line).evaluate(*map(np.asarray, arrays)), line)
 
     def _lower_on_cpu(self, context, *arrays, line: Line):
         of, call = self.of(line), self._compile_operations
         if not context.module_context.lowering_parameters.for_export:  # where it runs elsewhere
-            code = of.code_of_jit(_is_wide(context.avals_in[0].shape[:-1]))
+            code = self._code_for(context.avals_in, of)[0]
             call = self._call_host if code is None else self._call_code
             if code is not None:
                 _register_handler()
@@ -214,17 +301,47 @@ class _LineMap(LinearMap):
     def _call_host(self, *arrays, line: Line):
         return call_host(functools.partial(self.evaluate, line=line), self.shape(*arrays, line=line), *arrays)
 
+    def _code_for(self, arrays, of: Line) -> tuple[LineCode | None, list[int], list[int]]:
+        """The code for arrays of these shapes; which of them rows share, and the axes of these rows."""
+        batch = _rows_of(arrays)
+        missing = [frozenset(i for i, size in enumerate(x.shape[:-1]) if size < batch[i]) for x in arrays]
+        axes = sorted(frozenset.intersection(*filter(None, missing))) if any(missing) else []
+        if not axes:  # of a single row the longest array: the numbers of a scene, which are often constants to XLA
+            axes, longest = list(range(len(batch))), max(range(len(arrays)), key=lambda k: arrays[k].shape[-1])
+            given = [longest] if math.prod(batch) == 1 < len(arrays) else []
+        else:
+            given = [k for k, absent in enumerate(missing) if absent]
+        ends = np.cumsum([0, *(x.shape[-1] for x in arrays)]).tolist()
+        shared = tuple(i for k in given for i in range(ends[k], ends[k + 1]))
+        code = of.code_of_jit(math.prod(batch[i] for i in axes) >= LANES // 2, shared)
+        return code, given if code is not None and code.shared else [], axes
+
     def _call_code(self, *arrays, line: Line):
-        x, of = jnp.concatenate(arrays, axis=-1), self.of(line)
-        code = of.code_of_jit(_is_wide(x.shape[:-1]))
+        of, batch = self.of(line), _rows_of(arrays)
+        code, given, axes = self._code_for(arrays, of)
         assert code is not None
-        rows = jax.ShapeDtypeStruct((math.prod(x.shape[:-1]), of.outputs), np.float64)
-        result = jax.ffi.ffi_call(_TARGET, rows)(x.reshape(-1, x.shape[-1]), line=np.int64(code.address))
-        return [result.reshape(*x.shape[:-1], of.outputs)]
+        outer = [i for i in range(len(batch)) if i not in axes]
+        times, rows = (math.prod(batch[i] for i in some) for some in (outer, axes))
+
+        def place(some: list, sizes: list[int], count: int):
+            some = [jnp.broadcast_to(x, (*sizes, x.shape[-1])) for x in some] or [jnp.zeros((*sizes, 0))]
+            return jnp.concatenate(some, axis=-1).transpose(*outer, *axes, len(batch)).reshape(times, count, -1)
+
+        still = place([arrays[k] for k in given], [1 if i in axes else size for i, size in enumerate(batch)], 1)
+        moving = place([x for k, x in enumerate(arrays) if k not in given], list(batch), rows)
+        result = jax.ShapeDtypeStruct((times, rows, len(of.line.outputs)), np.float64)
+        result = jax.ffi.ffi_call(_TARGET, result)(moving, still, line=np.int64(code.address))
+        back = np.argsort([*outer, *axes, len(batch)]).tolist()
+        return self._split(result.reshape(*(batch[i] for i in (*outer, *axes)), -1).transpose(*back), line)
+
+    def _batch(self, arrays, axes, **settings):
+        arrays = [x[None] if at is None else jnp.moveaxis(x, at, 0) for x, at in zip(arrays, axes, strict=True)]
+        outs = self.bind(*arrays, **settings)
+        return outs, [0] * len(outs)
 
     def _compile_operations(self, *arrays, line: Line):
         columns = tuple(x[..., i] for x in arrays for i in range(x.shape[-1]))
-        return [jnp.stack(emit(self.of(line).line, columns), axis=-1)]
+        return self._split(jnp.stack(emit(self.of(line).line, columns), axis=-1), line)
 
     def _call_from_gpu(self, *arrays, line: Line):
         if len(self.of(line).line.nodes) <= forms.LARGEST_COMPILED:
@@ -237,9 +354,9 @@ class _LineMap(LinearMap):
         return jax.pure_callback(evaluate, self.shape(*arrays, line=line), *arrays)
 
 
-def _is_wide(batch: tuple[int, ...]) -> bool:
-    """True if there are enough rows for a vector of lanes to pay."""
-    return math.prod(batch) >= LANES // 2
+def _rows_of(arrays) -> tuple[int, ...]:
+    """The axes of rows of arrays, which broadcast."""
+    return np.broadcast_shapes(*(x.shape[:-1] for x in arrays))
 
 
 @make_once
@@ -255,9 +372,9 @@ def _pull(x, w, _, line: Line):
     return back_p.bind(*x, *w, line=line)
 
 
-value_p = _LineMap("value", lambda line: line, lambda line: line.outputs)
-forward_p = _LineMap("forward", lambda line: line.forward, lambda line: line.outputs, 1, _pull)
-back_p = _LineMap("back", lambda line: line.back, lambda line: line.width, 1, _push)
+value_p = _LineMap("value", lambda line: line, lambda line: [line.outputs, *filter(None, [line.memo])])
+forward_p = _LineMap("forward", lambda line: line.forward, lambda line: [line.outputs], 1, _pull)
+back_p = _LineMap("back", lambda line: line.back, lambda line: [line.width], 1, _push)
 
 
 # ---- operations of functions on the host -----------------------------------------------------------------------------

@@ -4,6 +4,7 @@ JAX would differentiate L twice more for a derivative of the accelerations, and 
 differentiated on its graph instead (`_line_functions`), and XLA compiles a call.
 """
 
+import functools
 from collections.abc import Callable
 
 import equinox as eqx
@@ -18,44 +19,80 @@ from lagjax._tracing import Program
 
 
 def lowered_motion(derivation: Derivation) -> Motion:
-    """The motion of a scene by its programs; as the scene is written where it has none that may be differentiated."""
+    """The motion of a scene by its programs; as the scene is written where it has none that may be differentiated.
+
+    They are lowered by the first quantity that is asked for.
+    """
     motion = derivation.motion
-    if not derivation.differentiates:
+    if derivation.form.is_sparse:
         return motion
     constraints = motion.constraints
     if constraints.exist:
-        constraints = _LoweredConstraints(constraints.on_positions, constraints.on_velocities, derivation=derivation)
+        constraints = _LoweredConstraints(**vars(constraints), derivation=derivation)
     functions = motion.lagrangian, motion.forces, motion.dissipation
     return _LoweredMotion(*functions, constraints, derivation=derivation)
 
 
-def _quantity(name: str) -> Callable:
-    def evaluate(self, q, qdot, t, params):
-        return _evaluate(self.derivation, q, qdot, t, params, name)[0]
+def _lowered(as_written: Callable) -> Callable:
+    """A decorator: the method is that of the scene `as_written` where its programs may not be differentiated."""
+
+    def decorate(method: Callable) -> Callable:
+        @functools.wraps(method)
+        def evaluate(self, *state):
+            return (method if self.derivation.differentiates else as_written)(self, *state)
+
+        return evaluate
+
+    return decorate
+
+
+def _quantity(as_written: Callable) -> Callable:
+    @_lowered(as_written)
+    def evaluate(self, *state):
+        return _evaluate(self.derivation, *state, as_written.__name__)[0]
 
     return evaluate
 
 
 class _LoweredConstraints(Constraints):
     derivation: Derivation = eqx.field(static=True, kw_only=True)
-    residual, rates, jacobian, gamma = map(_quantity, ("residual", "rates", "jacobian", "gamma"))
+    residual, rates = map(_quantity, (Constraints.residual, Constraints.rates))
+    jacobian, gamma = map(_quantity, (Constraints.jacobian, Constraints.gamma))
 
+    @_lowered(Constraints.f)
     def f(self, q, t, params):
         return self.residual(q, jnp.zeros_like(q), t, params)[: self.derivation.position_count]
 
 
 class _LoweredMotion(Motion):
     derivation: Derivation = eqx.field(static=True, kw_only=True)
-    momentum, mass_matrix, generalized_force = map(_quantity, ("momentum", "mass_matrix", "generalized_force"))
+    momentum, mass_matrix = map(_quantity, (Motion.momentum, Motion.mass_matrix))
+    generalized_force = _quantity(Motion.generalized_force)
 
+    @_lowered(Motion.mass_matrix_and_force)
     def mass_matrix_and_force(self, q, qdot, t, params):
         """M and F of M q̈ = F + Gᵀλ."""
         return tuple(_evaluate(self.derivation, q, qdot, t, params, "mass_matrix", "force"))
 
+    @_lowered(Motion.energy)
     def energy(self, q, qdot, t, params):
         momentum, value = _evaluate(self.derivation, q, qdot, t, params, "momentum", "lagrangian")
         return momentum @ qdot - value
 
+    def unbalanced_force(self, q, qdot, qddot, t, params):
+        """M q̈ − F, by a program of its own."""
+        if self.derivation.differentiates_force:
+            return _outputs(self.derivation.unbalanced_force, q, qdot, t, params, qddot)
+        return super().unbalanced_force(q, qdot, qddot, t, params)
+
+    def required_force(self, q, qdot, t, params, qddot, terms=0.0):
+        """τ at an acceleration, and which constraints that violates beyond rounding."""
+        state, of = (q, qdot, t, params), self.derivation
+        if self.constrained and of.differentiates:
+            terms = jax.lax.stop_gradient(_outputs(of.term_program(("gamma",)), *state))
+        return super().required_force(*state, qddot, terms)
+
+    @_lowered(Motion.solved_acceleration)
     def solved_acceleration(self, q, qdot, t, params):
         """q̈, NaN where its matrix is singular, and whether that is so."""
         try:
@@ -71,7 +108,7 @@ def _evaluate(derivation: Derivation, q, qdot, t, params, *names: str) -> list[A
     return list(derivation.split_outputs(names, values).values())
 
 
-def _outputs(program: Program, q, qdot, t, params) -> Array:
-    """The outputs of a program of (q, q̇, t, numbers), (outputs,)."""
+def _outputs(program: Program, q, qdot, t, params, *more) -> Array:
+    """The outputs of a program of (q, q̇, t, numbers) and more vectors, (outputs,)."""
     numbers = jnp.concatenate([jnp.zeros(0, q.dtype), *(jnp.ravel(x).astype(q.dtype) for x in jax.tree.leaves(params))])
-    return line_of(program)(q, qdot, jnp.reshape(t, 1).astype(q.dtype), numbers)
+    return line_of(program)(q, qdot, jnp.reshape(t, 1).astype(q.dtype), numbers, *more)

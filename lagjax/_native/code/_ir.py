@@ -26,6 +26,7 @@ from llvmlite import ir
 from lagjax._native.code._objects import load_or_make
 
 DOUBLE, INTEGER, BIT, POINTER = ir.DoubleType(), ir.IntType(64), ir.IntType(1), ir.PointerType()
+LINE_ARGUMENTS = [POINTER, POINTER, INTEGER, POINTER, INTEGER]  # those of a `LineCode`
 COUNTED = "counted"  # the name of the blocks at which counted loops begin
 _CONTRACT = ("contract",)
 # What LLVM itself calls for an intrinsic that the processor has no instruction for.

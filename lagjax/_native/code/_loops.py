@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from llvmlite import ir
 
-from lagjax._native.code._ir import BIT, DOUBLE, INTEGER, LEVELS, POINTER, Code, Value, compile_text
+from lagjax._native.code._ir import BIT, DOUBLE, INTEGER, LEVELS, LINE_ARGUMENTS, POINTER, Code, Value, compile_text
 
 if TYPE_CHECKING:
     Floats = Wholes = Any
@@ -506,9 +506,9 @@ class _Writer:
         return "bool", self.code.compare("==", x - x, 0.0)
 
     def call_evaluate(self, node, address, x, out):
-        kind = ir.FunctionType(ir.VoidType(), [POINTER, POINTER, INTEGER])
+        kind, one = ir.FunctionType(ir.VoidType(), LINE_ARGUMENTS), ir.Constant(INTEGER, 1)
         place = self.builder.inttoptr(address[1].it, kind.as_pointer())
-        return None, Value(self.code, self.builder.call(place, [x[1].it, out[1].it, ir.Constant(INTEGER, 1)]))
+        return None, Value(self.code, self.builder.call(place, [x[1].it, out[1].it, one, x[1].it, one]))
 
     def call_integrate(self, node, begin, plan, *given):
         arrays, (members, times) = [x.it for _, x in given[:-2]], [x.it for _, x in given[-2:]]

@@ -1,21 +1,25 @@
 """Straight lines as calls of XLA: rows of inputs to rows of outputs, without Python and without a compiler of XLA's.
 
-One handler serves all lines: the attribute of a call is where the machine code of its line is.
+One handler serves all lines: the attribute of a call is where the machine code of its line is. What many rows share,
+as the directions of a Jacobian share their state, is computed once:
+
+    inputs of all rows ─► what depends on these alone, once ─► the rest, several rows side by side
 """
 
 import ctypes
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from llvmlite import ir
 
 from lagjax._native.code._constants import LARGEST_LINE
-from lagjax._native.code._ir import DOUBLE, INTEGER, POINTER, Code, Value, compile_module
+from lagjax._native.code._ir import DOUBLE, INTEGER, LINE_ARGUMENTS, POINTER, Code, Value, compile_module
 from lagjax._native.motions._handler import call, compile_handler, load_at, make_once
 from lagjax._native.series._lanes import emit, sincos_function
-from lagjax._program import OPERATIONS, Graph, StraightLine, operation_error
+from lagjax._program import OPERATIONS, Graph, StraightLine, eliminate_dead_code, operation_error
 
 _SET_ROWS = "set_rows"
 
@@ -23,61 +27,81 @@ _SET_ROWS = "set_rows"
 class LineCode:
     """A straight line of `inputs` floats in machine code, for as long as this object lives.
 
-    At its `address` is `evaluate(x, out, rows)`, with x (rows, inputs) and out (rows, outputs). A line of more than
-    `largest` operations is a walk along rows of integers, for which LLVM takes no longer. Where its first inputs, so
-    many, are `moving`, that gives the running errors of the outputs in their place (`_program._rounding`): a line of
-    them would be five times as long. What is written out may take several rows at once, in `lanes`. Every operation
-    rounds, so that all of these forms have the same digits on every processor, and in C (`_c_lines`). Raises
-    `Unlowerable`.
+    At its `address` is `evaluate(x, out, rows, given, times)`, `times` times with x (rows, inputs) and out (rows,
+    outputs). Inputs that are `shared` are the same in all `rows` and stand in given (times, shared), x has the others.
+    A line of more than `largest` operations is a walk along rows of integers, for which LLVM takes no longer, and
+    shares none. Where its first inputs, so many, are `moving`, that gives the running errors of the outputs in their
+    place (`_program._rounding`): a line of them would be five times as long. What is written out may take several rows
+    at once, in `lanes`. Every operation rounds, so that all of these forms have the same digits on every processor,
+    and in C (`_c_lines`). Raises `Unlowerable`.
     """
 
     def __init__(
-        self, line: StraightLine, inputs: int, moving: int | None = None, largest: int = LARGEST_LINE, lanes: int = 1
+        self,
+        line: StraightLine,
+        inputs: int,
+        moving: int | None = None,
+        largest: int = LARGEST_LINE,
+        lanes: int = 1,
+        shared: Sequence[int] = (),
     ):
         module, outputs = ir.Module("line"), len(line.outputs)
         module.triple = ""
         filled = [k for k in range(outputs) if line.constant(k) != 0]
         long = moving is not None or len(line.nodes) + len(filled) > largest
-        lanes = 1 if long else lanes
-        turns = any(op in ("sin", "cos") for op, _, _ in line.nodes)
-        sincos = sincos_function(module, lanes, rounds=True) if turns else None
+        lanes, self.shared = (1, ()) if long else (lanes, tuple(shared))
         write = _RowWalk(line, inputs, filled, moving) if long else None
-        room = 1 if write is None else 2 ** math.ceil(math.log2(2 * write.size))
-        code = Code(module, "evaluate", [POINTER, POINTER, INTEGER], lanes, public=True, rounds=True)
-        (x, out, rows), room = code.arguments, code.stack(room)
-        if lanes > 1:
-            _write_tiles(code, sincos, line, inputs, filled)
-        else:
-            with code.loop(rows) as row:
-                here, there = code.element(x, row * inputs), code.element(out, row * outputs)
-                code.fill(there, outputs if len(filled) < outputs else 0)
-                if write is not None:
-                    write(code, sincos, here, there, room)
-                else:
-                    _write_line(code, sincos, line, filled, here, there)
+        common, rest = (None, line) if long else _split_line(line, inputs, filled, self.shared)
+        own, begin = inputs - len(self.shared), common and _write_common(module, common, len(self.shared))
+        room = len(common.outputs) if common else 1 if write is None else 2 ** math.ceil(math.log2(2 * write.size))
+        code, sincos = (
+            Code(module, "evaluate", LINE_ARGUMENTS, lanes, public=True, rounds=True),
+            _sincos_of(module, rest, lanes),
+        )
+        (x, out, rows, given, times), room = code.arguments, code.stack(max(1, room))
+        with code.loop(times) as time:
+            if begin is not None:
+                code.call(begin, code.element(given, time * len(self.shared)), room)
+            x, out = code.element(x, time * rows * own), code.element(out, time * rows * outputs)
+            if lanes > 1:
+                _write_tiles(code, sincos, rest, own, filled, (x, out, rows, room))
+            else:
+                with code.loop(rows) as row:
+                    here, there = code.element(x, row * own), code.element(out, row * outputs)
+                    code.fill(there, outputs if len(filled) < outputs else 0)
+                    if write is not None:
+                        write(code, sincos, here, there, room)
+                    else:
+                        _write_line(code, sincos, rest, own, filled, here, there, room)
         code.finish()
         names = ("evaluate",) if write is None else ("evaluate", _SET_ROWS)
-        level = 0 if write is None and compilation_work(line, lanes) > WORK_OPTIMISED else None
+        level = 0 if write is None and compilation_work(rest, lanes) > WORK_OPTIMISED else None
         self._engine, places = compile_module(module, names, level)
         if write is not None:
             self._numbers = write.numbers
             ctypes.CFUNCTYPE(None, ctypes.c_void_p)(places[_SET_ROWS])(self._numbers.ctypes.data)
         self.address, self._outputs = places["evaluate"], outputs
-        self._evaluate = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(self.address)
+        self._evaluate = line_function(self.address)
 
-    def __call__(self, rows: np.ndarray) -> np.ndarray:
-        """The outputs (R, outputs) at rows (R, inputs)."""
+    def __call__(self, rows: np.ndarray, given: np.ndarray | None = None) -> np.ndarray:
+        """The outputs (R, outputs) at rows (R, inputs) without those that are shared, which are `given`."""
         rows, found = np.ascontiguousarray(rows, float), np.empty((len(rows), self._outputs))
-        self._evaluate(rows.ctypes.data, found.ctypes.data, len(rows))
+        given = np.ascontiguousarray([] if given is None else given, float)
+        self._evaluate(rows.ctypes.data, found.ctypes.data, len(rows), given.ctypes.data, 1)
         return found
+
+
+line_function = ctypes.CFUNCTYPE(
+    None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64
+)
 
 
 _QUICK = frozenset(("add", "sub", "mul", "div", "neg", "constant", "input"))
 _WIDE = frozenset(("sin", "cos", "sqrt", "abs"))  # functions that take a vector as a number
 
 
-# Beyond this work LLVM does not optimise a line that is written out. For 39 000 operations it takes 1.6 s so, else 5 s,
-# and a row of many then 6 µs, else 2.
+# Beyond this work LLVM does not optimise a line that is written out, nor what its rows share. For 39 000 operations it
+# takes 1.6 s so, else 5 s, and a row of many then 6 µs, else 2; for 16 000 0.4 s, else 1.1, and a row 10 µs, else 7.
 WORK_OPTIMISED = 12_000
 
 
@@ -94,19 +118,80 @@ def compilation_work(line: StraightLine, lanes: int) -> int:
     return sum(weights)
 
 
-def _write_line(code: Code, sincos: Code | None, line: StraightLine, filled: list[int], x: Value, out: Value) -> None:
-    """Write the outputs that are `filled` of a line, operation by operation; a number of x and `out` has all lanes."""
+def _split_line(
+    line: StraightLine, inputs: int, filled: list[int], shared: tuple[int, ...]
+) -> tuple[StraightLine | None, StraightLine]:
+    """The line of what depends on inputs that are shared alone, and the rest of those that are not, then its outputs.
+
+    Each has the inputs of its own from 0 on, in order. None where nothing is computed of shared inputs.
+    """
+    own = {i: k for k, i in enumerate(i for i in range(inputs) if i not in set(shared))}
+    if not shared:
+        return None, line
+    varies: list[bool] = []
+    for op, operands, attribute in line.nodes:
+        varies.append(attribute in own if op == "input" else any(varies[i] for i in operands))
+    read = {
+        i for k, (_, operands, _) in enumerate(line.nodes) if varies[k] or line.kinds[k] != "float" for i in operands
+    }
+    read |= {line.outputs[k] for k in filled}
+    kept = [i for i in sorted(read) if not varies[i] and line.kinds[i] == "float" and line.nodes[i][0] != "constant"]
+    places = {i: len(own) + k for k, i in enumerate(kept)}
+
+    def renumber(places: dict[int, int], of: dict[int, int]) -> StraightLine:
+        nodes = enumerate(line.nodes)
+        moved = (
+            ("input", (), places[i]) if i in places else (op, operands, of.get(at) if op == "input" else at)
+            for i, (op, operands, at) in nodes
+        )
+        return line.replace(nodes=tuple(moved))
+
+    rest = eliminate_dead_code(renumber(places, own), line.outputs)
+    return eliminate_dead_code(renumber({}, {i: k for k, i in enumerate(shared)}), kept), rest
+
+
+def _sincos_of(module: ir.Module, line: StraightLine, lanes: int) -> Code | None:
+    turns = any(op in ("sin", "cos") for op, _, _ in line.nodes)
+    return sincos_function(module, lanes, f"sincos{lanes}", rounds=True) if turns else None
+
+
+def _write_common(module: ir.Module, line: StraightLine, inputs: int) -> Code:
+    """The function (inputs, outputs) of a line."""
+    code, sincos = Code(module, "common", [POINTER, POINTER], 1, rounds=True), _sincos_of(module, line, 1)
+    given, out = code.arguments
+    if compilation_work(line, 1) > WORK_OPTIMISED:
+        for attribute in ("noinline", "optnone"):
+            code.function.attributes.add(attribute)
+    _write_line(code, sincos, line, inputs, list(range(len(line.outputs))), given, out, given)
+    return code.finish()
+
+
+def _write_line(
+    code: Code, sincos: Code | None, line: StraightLine, own: int, filled: list[int], x: Value, out: Value, room: Value
+) -> None:
+    """Write the outputs that are `filled` of a line, operation by operation; a number of x and `out` has all lanes.
+
+    Inputs beyond the `own` ones stand in a `room`, one number for all lanes.
+    """
     lanes = code.lanes
-    read = functools.cache(lambda i: code.load(code.element(x, i * lanes), code.vector))
+
+    @functools.cache
+    def read(i: int) -> Value:
+        if i < own:
+            return code.load(code.element(x, i * lanes), code.vector)
+        return code.load(code.element(room, i - own), DOUBLE)
+
     line = line.replace(outputs=tuple(line.outputs[k] for k in filled))
     for k, i, value in zip(filled, line.outputs, emit(code, line, read, sincos, None), strict=True):
         number = code.as_number(value) if line.kinds[i] == "bool" else value
         code.store(code.lanes_of(number), code.element(out, k * lanes))
 
 
-def _write_tiles(code: Code, sincos: Code | None, line: StraightLine, inputs: int, filled: list[int]) -> None:
+def _write_tiles(
+    code: Code, sincos: Code | None, line: StraightLine, inputs: int, filled: list[int], arrays: tuple[Value, ...]
+) -> None:
     """Write a line for tiles of rows, one in a lane; those beyond the last are that once more."""
-    (x, out, rows), lanes, outputs = code.arguments, code.lanes, len(line.outputs)
+    (x, out, rows, room), lanes, outputs = arrays, code.lanes, len(line.outputs)
     given, found = code.stack(inputs * lanes, 64), code.stack(outputs * lanes, 64)
     with code.loop(outputs * lanes) as k:
         code.store(code.as_value(0.0, DOUBLE), code.element(found, k))
@@ -119,7 +204,7 @@ def _write_tiles(code: Code, sincos: Code | None, line: StraightLine, inputs: in
             row = code.element(x, (first.value + own) * inputs)
             with code.loop(inputs) as k:
                 code.store(code.load(code.element(row, k), DOUBLE), code.element(given, k * lanes + j))
-        _write_line(code, sincos, line, filled, given, found)
+        _write_line(code, sincos, line, inputs, filled, given, found, room)
         with code.loop(here) as j:
             row = code.element(out, (first.value + j) * outputs)
             with code.loop(outputs) as k:
@@ -220,10 +305,12 @@ class _RowWalk:
 
 @make_once
 def line_handler() -> int:
-    """The address of the handler of all lines: from x (rows, inputs) to a result (rows, outputs), both of doubles."""
+    """The address of the handler of all lines: from x (times, rows, inputs) and what is shared, (times, shared), to a
+    result (times, rows, outputs), all of doubles."""
 
     def evaluate(code: Code, line: Value, data: list[Value], dims: list[Value]) -> None:
         address = Value(code, code.builder.ptrtoint(line.it, INTEGER))
-        call(code, address, ir.VoidType(), *data, load_at(dims[0], 0, INTEGER))
+        (x, given, out), (times, rows) = data, (load_at(dims[0], offset, INTEGER) for offset in (0, 8))
+        call(code, address, ir.VoidType(), x, out, rows, given, times)
 
-    return compile_handler("line_handler", 1, 1, lambda module: evaluate)["handler"]
+    return compile_handler("line_handler", 2, 1, lambda module: evaluate)["handler"]

@@ -20,7 +20,7 @@ from jax.interpreters import mlir
 from lagjax._engine import Problem
 from lagjax._engine.taylor import Line, MachineCode, Surfaces, Tolerances, line_of, rate_errors
 from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL, is_concrete
-from lagjax._native import LARGEST_LINE, SINGLE_NOISE, LineCode, Loop, compile_loops, cores, handler
+from lagjax._native import LARGEST_LINE, SINGLE_NOISE, LineCode, Loop, compile_loops, cores, handler, line_function
 from lagjax._primitives import LinearMap, call_host, compute_on_host
 from lagjax._run.jumps._driver import ASKS, GOING, NEW
 from lagjax._run.jumps._field_places import Places
@@ -202,14 +202,14 @@ class SceneCode:
 def _call_numpy(line: Line) -> tuple[Any, int]:
     """A function that evaluates a line by NumPy, called as machine code is, and its address: for tables."""
 
-    def evaluate(x: int, out: int, _rows: int) -> None:
+    def evaluate(x: int, out: int, *_: int) -> None:
         given, found = (
             np.ctypeslib.as_array((ctypes.c_double * size).from_address(place))
             for place, size in ((x, line.size), (out, line.outputs))
         )
         found[:] = line.line.evaluate(list(given[:, None]))[:, 0]
 
-    function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(evaluate)
+    function = line_function(evaluate)
     address = ctypes.cast(function, ctypes.c_void_p).value
     assert address is not None
     return function, address
