@@ -140,6 +140,8 @@ def damped(q, v, params):
 DOUBLE_PENDULUM, CART, CENTRAL, CHARGE = map(lagjax.System, (double_pendulum, cart, central, charge))
 RUBBED = lagjax.System(damped, dissipation=lambda q, v, params: 0.5 * params["c"] * v**2)
 DRIVEN = lagjax.System(lambda q, v, t: 0.5 * v**2 + jnp.cos(q), forces=lambda q, v, t: 0.5 * jnp.cos(2 * t) - v / 3)
+EQUAL_NAMES = lagjax.System(lambda q, v, params: 0.5 * params["x"] * v["x"] ** 2 - params["t"] * q["x"] + params["x1"])
+NUMBERS = lagjax.System(lambda q, v: 0.5 * v**2 - 3 * 0.1 * q - q**2 / 6 + 1e-9 * q**3 + 2.5e12 * q**4 - np.pi * q**5)
 
 
 IN_THE_CHAPTER = [
@@ -206,11 +208,10 @@ def test_branches_stand_by_their_names():
 
 
 def test_names_that_coincide_are_told_apart():
-    system = lagjax.System(lambda q, v, params: 0.5 * params["x"] * v["x"] ** 2 - params["t"] * q["x"] + params["x1"])
     params = {"x": 2.0, "t": 0.5, "x1": 1.0}
-    equations = system.equations({"x": 1.0}, {"x": 1.0}, params=params)
+    equations = EQUAL_NAMES.equations({"x": 1.0}, {"x": 1.0}, params=params)
     assert equations.variables == ("q_x", "q_x_dot", "t", "params_t", "params_x", "x1")
-    require_equal(system, {"x": 1.0}, {"x": 0.3}, params)
+    require_equal(EQUAL_NAMES, {"x": 1.0}, {"x": 0.3}, params)
 
 
 def test_q_may_be_any_pytree_and_params_may_hold_whole_numbers():
@@ -229,12 +230,9 @@ def test_q_may_be_any_pytree_and_params_may_hold_whole_numbers():
 
 def test_numbers_print_short_and_come_back():
     """0.1 · 3 is 0.30000000000000004, a third is a fraction, and large and small ones have exponents."""
-    system = lagjax.System(
-        lambda q, v: 0.5 * v**2 - 3 * 0.1 * q - q**2 / 6 + 1e-9 * q**3 + 2.5e12 * q**4 - np.pi * q**5
-    )
-    (force,) = system.equations(1.0, 1.0).force.values()
+    (force,) = NUMBERS.equations(1.0, 1.0).force.values()
     assert force == "3e-9*q**2 + 1e13*q**3 - q/3 - 15.707963267948966*q**4 - 0.3"
-    require_equal(system, 1.0, 1.0)
+    require_equal(NUMBERS, 1.0, 1.0)
 
 
 def test_a_notebook_shows_them_in_latex():

@@ -19,6 +19,23 @@ SCENE = lagjax.System(
     lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2,
     forces=lambda q, qdot, params: -params["c"] * qdot,
 )
+WEIGHED_SPRING = lagjax.System(
+    lambda q, v, params: 0.5 * v**2 - 0.5 * jnp.dot(params["w"], jnp.array([2.0, 6.0])) * q**2
+)
+BALL_AND_BOARD = lagjax.System(
+    lambda q, qdot: 0.5 * qdot**2 - 9.81 * q,
+    contacts=lambda q, params: {"board": q - params["h"]},
+    restitution=lambda params: params["e"],
+)
+ROD = lagjax.System(
+    lambda q, qdot, params: 0.5 * jnp.sum(qdot**2) - params["g"] * q[1],
+    constraints=lambda q, params: jnp.sum(q**2) - params["l"] ** 2,
+)
+ANGLE = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 + 9.81 / params * jnp.cos(q))
+PAIR = lagjax.System(
+    lambda q, qdot, params: 0.5 * jnp.sum(qdot**2) - 0.5 * params["k"] * jnp.sum(q**2) - 0.5 * (q[0] - q[1]) ** 2
+)
+SINGLE = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2)
 
 
 def swing(ts, amplitude=1.0):
@@ -148,17 +165,16 @@ def test_amplitudes_that_starts_are_computed_from(transform):
 
 
 def test_an_array_of_every_record_and_a_transform_of_the_whole():
-    scene = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * jnp.dot(params["w"], jnp.array([2.0, 6.0])) * q**2)
     squares = np.array([3.0, 4.0, 5.0])
     rows = [lagjax.Record(TS, noisy(np.cos(np.sqrt(k) * TS), int(k)), start=(1.0, 0.0)) for k in squares]
     half = {"w": np.array([0.5, 0.5])}
-    fit = lagjax.fit(scene, rows, half, free=per_record, transforms=lagjax.simplex)
+    fit = lagjax.fit(WEIGHED_SPRING, rows, half, free=per_record, transforms=lagjax.simplex)
     assert fit.ok and fit.params["w"].shape == (3, 2)
     np.testing.assert_allclose(fit.params["w"].sum(axis=1), 1.0, rtol=1e-12)
     np.testing.assert_allclose(fit.params["w"] @ [2.0, 6.0], squares, rtol=2e-3)
     assert "params['w'][:, 1]" in str(fit)
     each = np.array([lagjax.positive, None])
-    apart = lagjax.fit(scene, rows, half, free={"w": per_record}, transforms={"w": each}, method="whole")
+    apart = lagjax.fit(WEIGHED_SPRING, rows, half, free={"w": per_record}, transforms={"w": each}, method="whole")
     assert not apart.ok and len(apart.unseen) == 3
     assert (
         "Of params['w'][2, 0] and params['w'][2, 1] only params['w'][2, 0] + 3 params['w'][2, 1] is" in apart.unseen[2]
@@ -195,11 +211,6 @@ def test_clocks_of_timings():
 
 @pytest.mark.slow
 def test_heights_of_a_board_that_a_ball_meets():
-    ball = lagjax.System(
-        lambda q, qdot: 0.5 * qdot**2 - 9.81 * q,
-        contacts=lambda q, params: {"board": q - params["h"]},
-        restitution=lambda params: params["e"],
-    )
     heights, ts = np.array([0.02, -0.03, 0.05]), np.linspace(0.0, 1.2, 121)
 
     def bounce(h):
@@ -211,36 +222,27 @@ def test_heights_of_a_board_that_a_ball_meets():
         return np.select([ts < first, ts < second], arcs[:2], arcs[2])
 
     rows = [lagjax.Record(ts, noisy(bounce(h), k, 1e-3), start=(1.0, 0.0)) for k, h in enumerate(heights)]
-    fit = lagjax.fit(ball, rows, {"h": 0.0, "e": 0.6}, free={"h": per_record, "e": True})
+    fit = lagjax.fit(BALL_AND_BOARD, rows, {"h": 0.0, "e": 0.6}, free={"h": per_record, "e": True})
     assert fit.ok and contains(fit, h=heights, e=0.7)
 
 
 @pytest.mark.slow
 def test_lengths_of_rods_whose_starts_lie_on_constraints():
-    rod = lagjax.System(
-        lambda q, qdot, params: 0.5 * jnp.sum(qdot**2) - params["g"] * q[1],
-        constraints=lambda q, params: jnp.sum(q**2) - params["l"] ** 2,
-    )
-    angle = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 + 9.81 / params * jnp.cos(q))
     lengths, ts, rows = np.array([0.9, 1.0, 1.1]), np.linspace(0.0, 3.0, 101), []
     for k, length in enumerate(lengths):
-        theta = np.asarray(lagjax.simulate(angle, 1.0, 0.0, ts, length).q)
+        theta = np.asarray(lagjax.simulate(ANGLE, 1.0, 0.0, ts, length).q)
         rows.append(lagjax.Record(ts, noisy(length * np.stack([np.sin(theta), -np.cos(theta)], axis=1), k, 1e-3)))
-    fit = lagjax.fit(rod, rows, {"g": 9.0, "l": 1.0}, free={"g": True, "l": per_record}, transforms=lagjax.positive)
+    fit = lagjax.fit(ROD, rows, {"g": 9.0, "l": 1.0}, free={"g": True, "l": per_record}, transforms=lagjax.positive)
     assert fit.ok and contains(fit, l=lengths, g=9.81)
 
 
 @pytest.mark.slow
 def test_of_several_systems_those_that_do_not_see_a_number_keep_it():
-    pair = lagjax.System(
-        lambda q, qdot, params: 0.5 * jnp.sum(qdot**2) - 0.5 * params["k"] * jnp.sum(q**2) - 0.5 * (q[0] - q[1]) ** 2
-    )
-    single = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2)
     slow, fast = np.cos(2.0 * TS), np.cos(np.sqrt(6.0) * TS)
     both = [lagjax.Record(TS, noisy(0.5 * np.stack([slow + fast, slow - fast], axis=1), k, 1e-3)) for k in range(2)]
     own = [lagjax.Record(TS, noisy(a * slow + o, k, 1e-3)) for k, (a, o) in enumerate(((1.0, 0.1), (0.5, -0.2)))]
     fit = lagjax.fit(
-        {"single": single, "pair": pair}, {"single": own, "pair": both}, {"k": 3.0, "offset": 0.0},
+        {"single": SINGLE, "pair": PAIR}, {"single": own, "pair": both}, {"k": 3.0, "offset": 0.0},
         observe={"single": shifted, "pair": None}, free={"k": True, "offset": per_record},
     )  # fmt: skip
     assert fit.ok and fit.covariance.names == ("params['k']", "params['offset'][0]", "params['offset'][1]")

@@ -191,6 +191,9 @@ WELL = lagjax.System(
 SMOOTH = lagjax.System(lambda q, v: -jnp.sqrt(1 - v**2) - 0.15 * (1 + jnp.tanh(q / 0.01)))
 WIRE = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q: q[1] - jnp.abs(q[0]))
 PUSHED = lagjax.System(lambda q, v: 0.5 * v @ v - 0.4 * q[0], constraints=lambda q: q[1] - jnp.maximum(q[0], 0.0))
+WIRE_OVER_A_STEP = lagjax.System(
+    lambda q, v: kinetic(v) - jnp.where(q[0] > 0, 0.3, 0.0), constraints=lambda q: q[1] - 0.5 * q[0]
+)
 
 
 @functools.cache
@@ -280,10 +283,7 @@ def test_well_and_ratchet_keep_their_energy():
 
 def test_constraint_beside_a_step():
     """A bead on a wire y = x/2 meets the step of a potential: as a mass of 1.25 along x."""
-    scene = lagjax.System(
-        lambda q, v: kinetic(v) - jnp.where(q[0] > 0, 0.3, 0.0), constraints=lambda q: q[1] - 0.5 * q[0]
-    )
-    q, v = end(scene, np.array([-1.0, -0.5]), np.array([1.0, 0.5]))
+    q, v = end(WIRE_OVER_A_STEP, np.array([-1.0, -0.5]), np.array([1.0, 0.5]))
     speed = np.sqrt(1 - 0.6 / 1.25)
     np.testing.assert_allclose(q, [2 * speed, speed], rtol=1e-8)
     np.testing.assert_allclose(v, [speed, 0.5 * speed], rtol=1e-8)
