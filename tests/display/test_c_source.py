@@ -90,7 +90,8 @@ def require_bits(built, system, q, qdot, params=None, t=0.3, spread=0.3):
 
 READY = [scenes.double_pendulum, scenes.spherical_pendulum, scenes.driven_pendulum, scenes.rolling_disc, scenes.kepler,
          scenes.cartesian_double_pendulum, scenes.chaplygin_sleigh, scenes.morse_oscillator, scenes.slider_crank,
-         scenes.relativistic_charge_in_magnetic_field, scenes.damped_driven_oscillator, scenes.chain]  # fmt: skip
+         scenes.figure_eight, scenes.relativistic_charge_in_magnetic_field, scenes.damped_driven_oscillator,
+         scenes.chain]  # fmt: skip
 
 
 @pytest.mark.parametrize("make", READY, ids=lambda make: make.__name__)
