@@ -191,8 +191,9 @@ class RunSettings:
     @classmethod
     def from_problem(cls, problem: Problem, engine: AbstractEngine, **more: Any) -> "RunSettings":
         known = all(map(is_concrete, jax.tree.leaves(engine)))
-        rtol, atol = (x if x is None or not is_concrete(x) else float(x) for x in problem.tolerances)
-        given = (rtol, atol) if is_concrete(rtol) and is_concrete(atol) else None
+        rtol, atol = problem.tolerances
+        of_numbers = lambda x: None if x is None else float(x)  # noqa: E731
+        given = (of_numbers(rtol), of_numbers(atol)) if is_concrete(rtol) and is_concrete(atol) else None
         return cls(engine if known else None, given, problem.max_steps, **more)
 
     @functools.cached_property
@@ -211,7 +212,7 @@ class RunSettings:
 class Trajectory(eqx.Module):
     """The motion of a system at the times `ts`, one trajectory or a batch of them.
 
-    - `ts`: the output times, shape (T,).
+    - `ts`: the output times, shape (T,), or (batch, T) where members have times of their own.
     - `q`, `qdot`: the structure of the initial state, with the time axis in front of every leaf, and the batch axis,
       if there is one, in front of that. NaN at times that were not reached.
     - `result`: how each member ended, one of `lagjax.RESULTS`; `ok`: whether it ended well, at the last time or at an
