@@ -75,6 +75,7 @@ def test_path(single):
 SPEEDS, FALL = np.linspace(0.1, 1.3, 20), np.linspace(0.0, 2.2, 12)
 CHAIN = lagjax.System(lambda q, qdot: 0.5 * qdot @ qdot - 0.5 * jnp.sum(jnp.diff(q) ** 2))
 SADDLE = lagjax.System(lambda q, v: 0.5 * v @ v + 0.5 * q[0] ** 2 - 2 * q[1] ** 2)
+COUPLED_PAIR = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q - 0.5 * (q[0] - q[1]) ** 2)
 
 
 @pytest.fixture(scope="module")
@@ -262,8 +263,7 @@ def test_motions_and_data_are_compared(single, batch):
 
 
 def test_shapes_of_modes():
-    scene = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q - 0.5 * (q[0] - q[1]) ** 2)
-    modes = lagjax.normal_modes(scene, np.zeros(2))  # 1, in step, and √3, against each other
+    modes = lagjax.normal_modes(COUPLED_PAIR, np.zeros(2))  # 1, in step, and √3, against each other
     axes = lagjax.plot.modes(modes)
     assert [ax.get_title() for ax in axes] == ["ω = 1", "ω = 1.732"]
     heights = [[bar.get_height() for bar in ax.patches] for ax in axes]

@@ -13,6 +13,30 @@ from lagjax._fit.search import _descent
 
 TS = np.linspace(0.0, 6.0, 151)
 STIFFNESS, FRICTION = 4.0, 0.2
+SPRING = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2)
+PAIR = lagjax.System(
+    lambda q, qdot, params: 0.5 * jnp.sum(qdot**2) - 0.5 * params["k"] * jnp.sum(q**2) - 0.5 * (q[0] - q[1]) ** 2
+)
+MIXED = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * jnp.dot(params["w"], jnp.array([2.0, 6.0])) * q**2)
+BALL = lagjax.System(
+    lambda q, qdot: 0.5 * qdot**2 - 9.81 * q,
+    contacts=lambda q, params: {"board": q - params["h"]},
+    restitution=lambda params: params["e"],
+)
+ROD = lagjax.System(
+    lambda q, qdot, params: 0.5 * jnp.sum(qdot**2) - params["g"] * q[1],
+    constraints=lambda q, params: jnp.sum(q**2) - params["l"] ** 2,
+)
+ANGLE = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 + 9.81 / params * jnp.cos(q))
+
+
+def double_pendulum(q, qdot, params):
+    kinetic = qdot[0] ** 2 + 0.5 * params["l"] ** 2 * qdot[1] ** 2
+    kinetic += params["l"] * qdot[0] * qdot[1] * jnp.cos(q[0] - q[1])
+    return kinetic + 9.81 * (2 * jnp.cos(q[0]) + params["l"] * jnp.cos(q[1]))
+
+
+DOUBLE = lagjax.System(double_pendulum)
 OFFSETS = np.array([0.1, -0.2, 0.05, 0.3])
 AMPLITUDES = np.array([1.0, 0.7, 1.3, 0.9])
 SCENE = lagjax.System(
@@ -148,17 +172,16 @@ def test_amplitudes_that_starts_are_computed_from(transform):
 
 
 def test_an_array_of_every_record_and_a_transform_of_the_whole():
-    scene = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * jnp.dot(params["w"], jnp.array([2.0, 6.0])) * q**2)
     squares = np.array([3.0, 4.0, 5.0])
     rows = [lagjax.Record(TS, noisy(np.cos(np.sqrt(k) * TS), int(k)), start=(1.0, 0.0)) for k in squares]
     half = {"w": np.array([0.5, 0.5])}
-    fit = lagjax.fit(scene, rows, half, free=per_record, transforms=lagjax.simplex)
+    fit = lagjax.fit(MIXED, rows, half, free=per_record, transforms=lagjax.simplex)
     assert fit.ok and fit.params["w"].shape == (3, 2)
     np.testing.assert_allclose(fit.params["w"].sum(axis=1), 1.0, rtol=1e-12)
     np.testing.assert_allclose(fit.params["w"] @ [2.0, 6.0], squares, rtol=2e-3)
     assert "params['w'][:, 1]" in str(fit)
     each = np.array([lagjax.positive, None])
-    apart = lagjax.fit(scene, rows, half, free={"w": per_record}, transforms={"w": each}, method="whole")
+    apart = lagjax.fit(MIXED, rows, half, free={"w": per_record}, transforms={"w": each}, method="whole")
     assert not apart.ok and len(apart.unseen) == 3
     assert (
         "Of params['w'][2, 0] and params['w'][2, 1] only params['w'][2, 0] + 3 params['w'][2, 1] is" in apart.unseen[2]
@@ -181,7 +204,7 @@ def test_delays_of_records():
 @pytest.mark.slow
 def test_clocks_of_timings():
     # Each clock began at another time before the pendulum was let go.
-    scene, late = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2), np.array([0.3, 0.5, 0.1])
+    late = np.array([0.3, 0.5, 0.1])
 
     def start(params):
         angle = jnp.sqrt(params["k"]) * params["late"]
@@ -189,17 +212,12 @@ def test_clocks_of_timings():
 
     times = [noisy(0.5 * (np.pi / 2 + np.pi * np.arange(6)) + delay, k, 1e-4) for k, delay in enumerate(late)]
     rows = [lagjax.Timings(lambda q, qdot: q, own, t0=0.0, start=start) for own in times]
-    fit = lagjax.fit(scene, rows, {"k": 3.8, "late": 0.3}, free={"k": True, "late": per_record})
+    fit = lagjax.fit(SPRING, rows, {"k": 3.8, "late": 0.3}, free={"k": True, "late": per_record})
     assert fit.ok and contains(fit, late=late, k=4.0)
 
 
 @pytest.mark.slow
 def test_heights_of_a_board_that_a_ball_meets():
-    ball = lagjax.System(
-        lambda q, qdot: 0.5 * qdot**2 - 9.81 * q,
-        contacts=lambda q, params: {"board": q - params["h"]},
-        restitution=lambda params: params["e"],
-    )
     heights, ts = np.array([0.02, -0.03, 0.05]), np.linspace(0.0, 1.2, 121)
 
     def bounce(h):
@@ -211,36 +229,27 @@ def test_heights_of_a_board_that_a_ball_meets():
         return np.select([ts < first, ts < second], arcs[:2], arcs[2])
 
     rows = [lagjax.Record(ts, noisy(bounce(h), k, 1e-3), start=(1.0, 0.0)) for k, h in enumerate(heights)]
-    fit = lagjax.fit(ball, rows, {"h": 0.0, "e": 0.6}, free={"h": per_record, "e": True})
+    fit = lagjax.fit(BALL, rows, {"h": 0.0, "e": 0.6}, free={"h": per_record, "e": True})
     assert fit.ok and contains(fit, h=heights, e=0.7)
 
 
 @pytest.mark.slow
 def test_lengths_of_rods_whose_starts_lie_on_constraints():
-    rod = lagjax.System(
-        lambda q, qdot, params: 0.5 * jnp.sum(qdot**2) - params["g"] * q[1],
-        constraints=lambda q, params: jnp.sum(q**2) - params["l"] ** 2,
-    )
-    angle = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 + 9.81 / params * jnp.cos(q))
     lengths, ts, rows = np.array([0.9, 1.0, 1.1]), np.linspace(0.0, 3.0, 101), []
     for k, length in enumerate(lengths):
-        theta = np.asarray(lagjax.simulate(angle, 1.0, 0.0, ts, length).q)
+        theta = np.asarray(lagjax.simulate(ANGLE, 1.0, 0.0, ts, length).q)
         rows.append(lagjax.Record(ts, noisy(length * np.stack([np.sin(theta), -np.cos(theta)], axis=1), k, 1e-3)))
-    fit = lagjax.fit(rod, rows, {"g": 9.0, "l": 1.0}, free={"g": True, "l": per_record}, transforms=lagjax.positive)
+    fit = lagjax.fit(ROD, rows, {"g": 9.0, "l": 1.0}, free={"g": True, "l": per_record}, transforms=lagjax.positive)
     assert fit.ok and contains(fit, l=lengths, g=9.81)
 
 
 @pytest.mark.slow
 def test_of_several_systems_those_that_do_not_see_a_number_keep_it():
-    pair = lagjax.System(
-        lambda q, qdot, params: 0.5 * jnp.sum(qdot**2) - 0.5 * params["k"] * jnp.sum(q**2) - 0.5 * (q[0] - q[1]) ** 2
-    )
-    single = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2)
     slow, fast = np.cos(2.0 * TS), np.cos(np.sqrt(6.0) * TS)
     both = [lagjax.Record(TS, noisy(0.5 * np.stack([slow + fast, slow - fast], axis=1), k, 1e-3)) for k in range(2)]
     own = [lagjax.Record(TS, noisy(a * slow + o, k, 1e-3)) for k, (a, o) in enumerate(((1.0, 0.1), (0.5, -0.2)))]
     fit = lagjax.fit(
-        {"single": single, "pair": pair}, {"single": own, "pair": both}, {"k": 3.0, "offset": 0.0},
+        {"single": SPRING, "pair": PAIR}, {"single": own, "pair": both}, {"k": 3.0, "offset": 0.0},
         observe={"single": shifted, "pair": None}, free={"k": True, "offset": per_record},
     )  # fmt: skip
     assert fit.ok and fit.covariance.names == ("params['k']", "params['offset'][0]", "params['offset'][1]")
@@ -252,22 +261,13 @@ def test_of_several_systems_those_that_do_not_see_a_number_keep_it():
 
 @pytest.mark.slow
 def test_chaotic_records_in_pieces_have_one_offset_each():
-    def double_pendulum(q, qdot, params):
-        kinetic = qdot[0] ** 2 + 0.5 * params["l"] ** 2 * qdot[1] ** 2
-        kinetic += params["l"] * qdot[0] * qdot[1] * jnp.cos(q[0] - q[1])
-        return kinetic + 9.81 * (2 * jnp.cos(q[0]) + params["l"] * jnp.cos(q[1]))
-
-    scene, ts, truth = (
-        lagjax.System(double_pendulum),
-        np.linspace(0.0, 15.0, 1501),
-        np.array([[0.05, -0.02], [-0.04, 0.03]]),
-    )
+    ts, truth = np.linspace(0.0, 15.0, 1501), np.array([[0.05, -0.02], [-0.04, 0.03]])
     rows = []
     for k, offset in enumerate(truth):
-        q = np.asarray(lagjax.simulate(scene, np.array([2.0, 2.3 + 0.2 * k]), np.zeros(2), ts, {"l": 1.0}).q)
+        q = np.asarray(lagjax.simulate(DOUBLE, np.array([2.0, 2.3 + 0.2 * k]), np.zeros(2), ts, {"l": 1.0}).q)
         rows.append(lagjax.Record(ts, noisy(q + offset, k)))
     free = {"l": True, "offset": per_record}
-    fit = lagjax.fit(scene, rows, {"l": 0.9, "offset": np.zeros(2)}, observe=shifted, free=free)
+    fit = lagjax.fit(DOUBLE, rows, {"l": 0.9, "offset": np.zeros(2)}, observe=shifted, free=free)
     assert fit.ok and "pieces" in fit.message and contains(fit, l=1.0, offset=truth)
 
 
