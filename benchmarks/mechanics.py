@@ -122,7 +122,7 @@ def peers(of, source, q, v, a) -> Iterator[tuple[str, Callable]]:
 
 def compile_casadi(of: robot.Robot) -> Iterator[tuple[str, Callable]]:
     """CasADi's accelerations and inverse dynamics of the same L, as C that is called with buffers."""
-    import casadi
+    import casadi  # pyright: ignore[reportMissingImports]
 
     n = len(of.moving)
     q, v, a = (casadi.SX.sym(name, n) for name in ("q", "v", "a"))
@@ -143,14 +143,14 @@ def compile_casadi(of: robot.Robot) -> Iterator[tuple[str, Callable]]:
             buffer, work = casadi.external("of", library).buffer()
             result = np.zeros(n)
             for i, array in enumerate(given):
-                buffer.set_arg(i, memoryview(array))
-            buffer.set_res(0, memoryview(result))
+                buffer.set_arg(i, array.data)
+            buffer.set_res(0, result.data)
             yield f"{name} by CasADi", work
 
 
 def lagrangian_in_casadi(of: robot.Robot, q, v):
     """`examples.robot._lagrangian` in CasADi."""
-    import casadi
+    import casadi  # pyright: ignore[reportMissingImports]
 
     still, total, k = casadi.SX.zeros(3), 0.0, 0
     state = {of.root: (still, still, casadi.SX([0.0, 0.0, 1.0]), 0.0)}
