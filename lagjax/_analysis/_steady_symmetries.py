@@ -111,7 +111,8 @@ def _solve_identities(of: _Terms, qdot: np.ndarray, consistent: np.ndarray) -> S
     of_force = of_force + of.force[:, None, turning, None] * np.eye(n)[:, None, turning]
     of_place = np.zeros((*of.place_by_q.shape[:2], len(turning), len(turning)))
     of_rates = of.rate_by_qdot[:, :, turning, None] * consistent[:, None, None, turning]
-    parts = [x.reshape(-1, len(turning) ** 2) for x in (of_l, of_force, of_place, of_rates)]
+    of_turns = of_l, of_force, of_place, of_rates
+    parts = [x.reshape(len(y), len(turning) ** 2) for x, y in zip(of_turns, right, strict=True)]
     left, right = np.concatenate(parts), -np.concatenate(right)
     sizes = np.maximum(np.abs(left).max(axis=1, initial=0), np.abs(right).max(axis=1))
     left, right = (x[sizes > 0] / sizes[sizes > 0, None] for x in (left, right))

@@ -117,8 +117,9 @@ def _rule(equation, known: dict) -> Callable:
     axes, shape = [x.aval.ndim for x in equation.invars], equation.outvars[0].aval.shape
     if function := getattr(equation.primitive, "on_host", None):
         return lambda *xs: function(*xs, **params)
-    if name in _UFUNCS and not (name == "div" and np.issubdtype(equation.outvars[0].aval.dtype, np.integer)):
-        call, most = _UFUNCS[name], max(axes)
+    whole = np.issubdtype(equation.outvars[0].aval.dtype, np.unsignedinteger)
+    if name in _UFUNCS and not (name == "div" and np.issubdtype(equation.outvars[0].aval.dtype, np.signedinteger)):
+        call, most = np.floor_divide if name == "div" and whole else _UFUNCS[name], max(axes)
         wide = [(slice(None), *[None] * (most - count)) for count in axes]  # a number of each member stands for all
         return call if min(axes) == most else lambda *xs: call(*(x[at] for x, at in zip(xs, wide, strict=True)))
     if name in _FOLDS:
@@ -291,7 +292,35 @@ def _scatter_add(dimension_numbers, mode, **_):
     return _each(rule)
 
 
+def _scan(jaxpr, length: int, num_consts: int, num_carry: int, reverse: bool, **_):
+    examples = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in jaxpr.in_avals]
+    body, behind = HostFunction(core.jaxpr_as_fun(jaxpr), *examples), num_consts + num_carry
+
+    def rule(*xs):
+        carry, rows = list(xs[num_consts:behind]), []
+        for k in range(length)[:: -1 if reverse else 1]:
+            results = body(*xs[:num_consts], *carry, *(x[:, k] for x in xs[behind:]))
+            carry, more = results[:num_carry], results[num_carry:]
+            rows.append(more)
+        columns = zip(*(rows[::-1] if reverse else rows), strict=True)
+        return [*carry, *(np.stack(share_rows(*column), axis=1) for column in columns)]
+
+    return rule
+
+
+def _less_in_order(**_):
+    """x < y where −0 is less than 0, and NaN is more than all."""
+
+    def rule(x, y):
+        between = np.signbit(x) & ~np.signbit(y) & (x == y)
+        return (x < y) | between | (np.isnan(y) & ~np.isnan(x))
+
+    return rule
+
+
 _RULES: dict[str, Callable] = {
+    "scan": _scan,
+    "lt_to": _less_in_order,
     "select_n": _select,
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _dynamic_update_slice,

@@ -175,7 +175,7 @@ class ContactChanges(NamedTuple):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True, eq=False)
 class RunSettings:
-    """How a motion was integrated: what another run of its scene needs. Equal to one with equal values.
+    """The engine of a motion and its options, which another run of its scene needs. Equal to one with equal values.
 
     - `engine`: what integrated it; None where numbers of its solver were being traced.
     - `tolerances`: rtol and atol as they were given; None where they were being traced.
@@ -191,9 +191,9 @@ class RunSettings:
     @classmethod
     def from_problem(cls, problem: Problem, engine: AbstractEngine, **more: Any) -> "RunSettings":
         known = all(map(is_concrete, jax.tree.leaves(engine)))
-        numbers = problem.tolerances if all(map(is_concrete, problem.tolerances)) else None
-        tolerances = numbers and tuple(None if x is None else float(x) for x in numbers)
-        return cls(engine if known else None, tolerances, problem.max_steps, **more)
+        rtol, atol = (x if x is None or not is_concrete(x) else float(x) for x in problem.tolerances)
+        given = (rtol, atol) if is_concrete(rtol) and is_concrete(atol) else None
+        return cls(engine if known else None, given, problem.max_steps, **more)
 
     @functools.cached_property
     def _key(self) -> tuple:
@@ -266,7 +266,7 @@ class Trajectory(eqx.Module):
         def __getattr__(self, name: str):
             text = f"A Trajectory has no attribute {name!r}."
             if name in ("t", "y", "ys", "sol"):
-                text += " Its times are `ts`, its states `q` and `qdot`; for states at more times give them in ts."
+                text += " Its times are `ts`, its states `q` and `qdot`; `at(t)` gives states at other times."
             raise AttributeError(text)
 
     def __repr__(self) -> str:
@@ -314,7 +314,6 @@ class Trajectory(eqx.Module):
         assert abs(run.at(2.5).q - jnp.cos(2.5)) < 1e-6
         ```
         """
-        self._require_present()
         return registered().find_states(self, t)
 
     def energy(self) -> jax.Array:

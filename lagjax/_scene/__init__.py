@@ -8,7 +8,7 @@ while they are traced.
 
 from lagjax._scene._closed_over import lift_batch, lift_problem
 from lagjax._scene._contacts import Contacts, ContactScene, Flat, InContact, Shapes
-from lagjax._scene._driven import Driven, asking_for_inputs, drive_scene, held_inputs, push_by_inputs
+from lagjax._scene._driven import Driven, asking_for_inputs, drive_function, drive_scene, held_inputs, push_by_inputs
 from lagjax._scene._explanation import Explanation
 from lagjax._scene._samples import HOLDS, MARGINS, continued, samples, unevenly_spaced
 from lagjax._scene._system import (

@@ -55,14 +55,18 @@ def _driven_once(scene: Any, find_inputs: Callable, extras: tuple[str, ...]) -> 
 
 
 def _driven(system: System, find_inputs: Callable, extras: tuple[str, ...]) -> System:
-    functions: dict[str, Function | None] = {}
-    for role in ROLES:
-        if (function := getattr(system, role)) is not None:
-            arrays, code = eqx.partition(_FunctionOfInputs(function, find_inputs), eqx.is_array)
-            asked = tuple(x for x in dict.fromkeys((*extras, *function.extras)) if x != "inputs")
-            function = Function(arrays, Edition.from_function(code), asked)
-        functions[role] = function
-    return replace_functions(system, functions)
+    functions = {role: getattr(system, role) for role in ROLES}
+    return replace_functions(
+        system, {role: f and drive_function(f, find_inputs, extras) for role, f in functions.items()}
+    )
+
+
+def drive_function(function: Function, find_inputs: Callable, extras: tuple[str, ...]) -> Function:
+    """A function of a scene for parameters that are `Driven`, as `drive_scene` makes it of all."""
+    arrays, code = eqx.partition(_FunctionOfInputs(function, find_inputs), eqx.is_array)
+    finding = extras if "inputs" in function.extras else ("params",)  # laws of contacts take nothing else
+    asked = tuple(x for x in dict.fromkeys((*finding, *function.extras)) if x != "inputs")
+    return Function(arrays, Edition.from_function(code), asked)
 
 
 def held_inputs(held: PyTree, t: Any) -> PyTree:

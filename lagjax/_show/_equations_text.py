@@ -91,7 +91,7 @@ def write_equations(system: "System", layout: Layout, params: PyTree, inputs: Py
             "they contain."
         )
     found = Formulas(line, 2 * layout.size + 1)
-    sums = dict(zip(quantities, _split(derivation, found, quantities), strict=True))
+    sums: dict[str, Any] = dict(zip(quantities, _split(derivation, found, quantities), strict=True))
     return _Page(found, sums, input_names(layout.names, numbers), names).equations()
 
 

@@ -153,6 +153,20 @@ def test_a_motion_goes_on_from_where_it_came_to_an_impact():
         lagjax.simulate(DROP, -1e-6, 1.0, np.array([0.0, 1.0]))
 
 
+def test_a_stretch_of_many_steps_is_finished_in_threads_of_xla_too(monkeypatch):
+    # These take the smallest numbers for zero: whether a kernel has more to do must not be one. A kernel of few rounds
+    # needs a scene of its own.
+    monkeypatch.setattr("lagjax._run.jumps._scene_code._ROUNDS", 1)
+    spring = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2, contacts=lambda q: q, restitution=0.8)
+
+    def end(h):
+        return lagjax.simulate(spring, h, 0.0, np.array([0.0, 2.0])).q[-1]
+
+    slope = 0.8 * np.sin(2.0 - np.pi / 2)  # q = h cos t, and −0.8 h cos t behind the floor
+    np.testing.assert_allclose(end(1.5), 1.5 * slope, rtol=1e-11)
+    np.testing.assert_allclose(jax.value_and_grad(end)(1.5), [1.5 * slope, slope], rtol=1e-11)
+
+
 @pytest.mark.slow
 def test_the_impact_at_a_cut_varies_as_any_does():
     """200 drops of micrometres in milliseconds, cut at their first or second impact, against whole motions.

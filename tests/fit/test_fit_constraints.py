@@ -62,3 +62,93 @@ def test_what_cannot_be_with_starts_on_constraints_is_a_sentence():
     record, _ = measured(1e-3)
     with pytest.raises(ValueError, match="starts must be 1 where starts on constraints are fitted"):
         lagjax.fit(SCENE, record, TRUTH, free=FREE, starts=4)
+
+
+# ---- driven, between walls, and in modes -----------------------------------------------------------------------------
+
+SWING = np.linspace(0.0, 3.0, 301)
+
+
+def on_circle(q):
+    return q @ q - 1.0
+
+
+def weight(q, qdot, params):
+    return 0.5 * qdot @ qdot - params["g"] * q[1]
+
+
+def bob(q, qdot, params):
+    """The same weight by its angle, which has no constraint: the truth."""
+    return 0.5 * qdot**2 + params["g"] * jnp.cos(q)
+
+
+def fit_swing(scene, angle_scene, truth, params0, **more):
+    theta = np.asarray(lagjax.simulate(angle_scene, 1.0, 0.0, SWING, truth).q)
+    values = np.stack([np.sin(theta), -np.cos(theta)], axis=1)
+    noise = 1e-3 * np.random.default_rng(0).normal(size=values.shape)
+    guess = lagjax.Guess(np.array([0.8, -0.5]), np.zeros(2))
+    record = lagjax.Record(SWING, values + noise, start=guess, **more)
+    fit = lagjax.fit(scene, record, params0, hold="cubic")
+    low, high = fit.intervals(0.999)
+    assert fit.ok and all(low[key] < value < high[key] for key, value in truth.items())
+    [(q, qdot)] = fit.starts
+    assert abs(q @ q - 1.0) < 1e-12 and abs(q @ qdot) < 1e-12
+    np.testing.assert_allclose(q, [np.sin(1.0), -np.cos(1.0)], atol=2e-3)
+    assert np.std(fit.predict(record).residuals) == pytest.approx(1e-3, rel=0.1)
+
+
+def push(q, qdot, params, inputs):
+    return params["gain"] * inputs * jnp.array([1.0, 0.0])
+
+
+def push_angle(q, qdot, t, params):
+    return params["gain"] * 2.0 * jnp.sin(3.0 * t) * jnp.cos(q)
+
+
+def drag(q, qdot, params):
+    return -params["c"] * qdot
+
+
+def bounce(params):
+    return params["e"]
+
+
+DRIVEN = lagjax.System(weight, forces=push, constraints=on_circle), lagjax.System(bob, forces=push_angle)
+WALLED = (
+    lagjax.System(weight, constraints=on_circle, contacts=lambda q: {"wall": q[0] + 0.3}, restitution=bounce),
+    lagjax.System(bob, contacts=lambda q: {"wall": jnp.sin(q) + 0.3}, restitution=bounce),
+)
+MODES = tuple(
+    lagjax.Hybrid({"air": air, "oil": oil}, [lagjax.Transition("air", "oil", guard)], "air")
+    for air, oil, guard in (
+        (
+            lagjax.System(weight, constraints=on_circle),
+            lagjax.System(weight, constraints=on_circle, forces=drag),
+            lambda q, qdot: q[0],
+        ),
+        (lagjax.System(bob), lagjax.System(bob, forces=drag), lambda q, qdot: q),
+    )
+)
+MOVED = lagjax.System(weight, constraints=lambda q, inputs: (q[0] - inputs) ** 2 + q[1] ** 2 - 1.0)
+
+
+@pytest.mark.slow
+def test_a_start_on_a_constraint_of_a_driven_scene():
+    u = 2.0 * np.sin(3.0 * SWING)
+    fit_swing(*DRIVEN, {"g": 9.81, "gain": 0.8}, {"g": 9.7, "gain": 0.5}, inputs=u)
+
+
+@pytest.mark.slow
+def test_a_start_on_a_constraint_beside_a_contact():
+    fit_swing(*WALLED, {"g": 9.81, "e": 0.8}, {"g": 9.7, "e": 0.78})
+
+
+@pytest.mark.slow
+def test_a_start_on_a_constraint_of_hybrid_motion():
+    fit_swing(*MODES, {"g": 9.81, "c": 0.5}, {"g": 9.7, "c": 0.4})
+
+
+def test_a_start_on_a_constraint_that_is_driven_is_refused():
+    record = lagjax.Record(SWING, np.stack([np.sin(SWING), -np.cos(SWING)], axis=1), inputs=0.1 * np.sin(SWING))
+    with pytest.raises(ValueError, match="A start on constraints that ask for `inputs` cannot be fitted"):
+        lagjax.fit(MOVED, record, {"g": 9.81}, hold="cubic")

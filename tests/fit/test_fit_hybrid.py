@@ -213,3 +213,59 @@ def test_an_oblique_impact_that_slides_is_found_from_where_it_sticks(mu):
     record = lagjax.Record(ts, exact + 0.002 * np.random.default_rng(0).normal(size=exact.shape), start=start)
     found = lagjax.fit(CUSHION, record, {"mu": mu, "e": 0.7}, transforms=lagjax.positive)
     assert found.ok and found.params["mu"] == pytest.approx(0.15, abs=0.003)
+
+
+# ---- sampled inputs --------------------------------------------------------------------------------------------------
+
+
+def fall(q, qdot):
+    return 0.5 * qdot**2 - 9.81 * q
+
+
+def push_by_inputs(damped):
+    return lambda q, qdot, params, inputs: params["gain"] * inputs - damped * params["c"] * qdot
+
+
+def push_by_time(change):
+    known = lambda t: jnp.where(t < change, 2.0, -1.0)
+    return lambda damped: lambda q, qdot, t, params: params["gain"] * known(t) - damped * params["c"] * qdot
+
+
+def pushed_ball(force):
+    laws = {"contacts": lambda q: {"floor": q}, "restitution": lambda params: params["e"]}
+    return lagjax.System(fall, forces=force(0.0), **laws)
+
+
+def pushed_modes(force):
+    """A spring, beyond an edge in oil."""
+    edge = lambda q, qdot, params: q - params["edge"]
+    modes = {
+        name: lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2, forces=force(damped))
+        for name, damped in (("free", 0.0), ("damped", 1.0))
+    }
+    there = lagjax.Transition("free", "damped", edge, direction=1, reset=lambda q, qdot, params: (q, qdot))
+    return lagjax.Hybrid(modes, [there, lagjax.Transition("damped", "free", edge, direction=-1)], "free")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "build, begin, change, ts, truth, params0",
+    [
+        (pushed_ball, 1.0, 0.5, np.linspace(0.0, 1.2, 121), {"gain": 0.8, "e": 0.7}, {"gain": 0.5, "e": 0.6}),
+        (pushed_modes, -1.0, 1.0, np.linspace(0.0, 5.0, 251), {"k": 4.0, "gain": 0.4, "c": 0.6, "edge": 0.1},
+         {"k": 3.8, "gain": 0.3, "c": 0.4, "edge": 0.12}),
+    ],
+)  # fmt: skip
+def test_motion_that_jumps_is_driven_by_samples(build, begin, change, ts, truth, params0):
+    more = {"c": 0.0} | truth
+    q = np.asarray(lagjax.simulate(build(push_by_time(change)), begin, 0.0, ts, more).q)
+    u = np.where(ts < change - 1e-9, 2.0, -1.0)
+    rows = [
+        lagjax.Record(ts, q + 1e-3 * np.random.default_rng(k).normal(size=len(ts)), inputs=u, start=start)
+        for k, start in enumerate(((begin, 0.0), lagjax.Guess(0.95 * begin, 0.1)))
+    ]
+    free = dict.fromkeys({"c": 0.0} | params0, True) | {"c": "c" in truth}
+    fit = lagjax.fit(build(push_by_inputs), rows, {"c": 0.0} | params0, free=free)
+    low, high = fit.intervals(0.999)
+    assert fit.ok and all(low[key] < value < high[key] for key, value in truth.items())
+    assert fit.starts[1][0] == pytest.approx(begin, abs=2e-3)

@@ -13,16 +13,12 @@ from lagjax._fit.search import _descent
 
 TS = np.linspace(0.0, 6.0, 151)
 STIFFNESS, FRICTION = 4.0, 0.2
-OFFSETS = np.array([0.1, -0.2, 0.05, 0.3])
-AMPLITUDES = np.array([1.0, 0.7, 1.3, 0.9])
-SCENE = lagjax.System(
-    lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2,
-    forces=lambda q, qdot, params: -params["c"] * qdot,
+SPRING = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2)
+PAIR = lagjax.System(
+    lambda q, qdot, params: 0.5 * jnp.sum(qdot**2) - 0.5 * params["k"] * jnp.sum(q**2) - 0.5 * (q[0] - q[1]) ** 2
 )
-WEIGHED_SPRING = lagjax.System(
-    lambda q, v, params: 0.5 * v**2 - 0.5 * jnp.dot(params["w"], jnp.array([2.0, 6.0])) * q**2
-)
-BALL_AND_BOARD = lagjax.System(
+MIXED = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * jnp.dot(params["w"], jnp.array([2.0, 6.0])) * q**2)
+BALL = lagjax.System(
     lambda q, qdot: 0.5 * qdot**2 - 9.81 * q,
     contacts=lambda q, params: {"board": q - params["h"]},
     restitution=lambda params: params["e"],
@@ -32,10 +28,21 @@ ROD = lagjax.System(
     constraints=lambda q, params: jnp.sum(q**2) - params["l"] ** 2,
 )
 ANGLE = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 + 9.81 / params * jnp.cos(q))
-PAIR = lagjax.System(
-    lambda q, qdot, params: 0.5 * jnp.sum(qdot**2) - 0.5 * params["k"] * jnp.sum(q**2) - 0.5 * (q[0] - q[1]) ** 2
+
+
+def double_pendulum(q, qdot, params):
+    kinetic = qdot[0] ** 2 + 0.5 * params["l"] ** 2 * qdot[1] ** 2
+    kinetic += params["l"] * qdot[0] * qdot[1] * jnp.cos(q[0] - q[1])
+    return kinetic + 9.81 * (2 * jnp.cos(q[0]) + params["l"] * jnp.cos(q[1]))
+
+
+DOUBLE = lagjax.System(double_pendulum)
+OFFSETS = np.array([0.1, -0.2, 0.05, 0.3])
+AMPLITUDES = np.array([1.0, 0.7, 1.3, 0.9])
+SCENE = lagjax.System(
+    lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2,
+    forces=lambda q, qdot, params: -params["c"] * qdot,
 )
-SINGLE = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2)
 
 
 def swing(ts, amplitude=1.0):
@@ -168,13 +175,13 @@ def test_an_array_of_every_record_and_a_transform_of_the_whole():
     squares = np.array([3.0, 4.0, 5.0])
     rows = [lagjax.Record(TS, noisy(np.cos(np.sqrt(k) * TS), int(k)), start=(1.0, 0.0)) for k in squares]
     half = {"w": np.array([0.5, 0.5])}
-    fit = lagjax.fit(WEIGHED_SPRING, rows, half, free=per_record, transforms=lagjax.simplex)
+    fit = lagjax.fit(MIXED, rows, half, free=per_record, transforms=lagjax.simplex)
     assert fit.ok and fit.params["w"].shape == (3, 2)
     np.testing.assert_allclose(fit.params["w"].sum(axis=1), 1.0, rtol=1e-12)
     np.testing.assert_allclose(fit.params["w"] @ [2.0, 6.0], squares, rtol=2e-3)
     assert "params['w'][:, 1]" in str(fit)
     each = np.array([lagjax.positive, None])
-    apart = lagjax.fit(WEIGHED_SPRING, rows, half, free={"w": per_record}, transforms={"w": each}, method="whole")
+    apart = lagjax.fit(MIXED, rows, half, free={"w": per_record}, transforms={"w": each}, method="whole")
     assert not apart.ok and len(apart.unseen) == 3
     assert (
         "Of params['w'][2, 0] and params['w'][2, 1] only params['w'][2, 0] + 3 params['w'][2, 1] is" in apart.unseen[2]
@@ -197,7 +204,7 @@ def test_delays_of_records():
 @pytest.mark.slow
 def test_clocks_of_timings():
     # Each clock began at another time before the pendulum was let go.
-    scene, late = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2), np.array([0.3, 0.5, 0.1])
+    late = np.array([0.3, 0.5, 0.1])
 
     def start(params):
         angle = jnp.sqrt(params["k"]) * params["late"]
@@ -205,7 +212,7 @@ def test_clocks_of_timings():
 
     times = [noisy(0.5 * (np.pi / 2 + np.pi * np.arange(6)) + delay, k, 1e-4) for k, delay in enumerate(late)]
     rows = [lagjax.Timings(lambda q, qdot: q, own, t0=0.0, start=start) for own in times]
-    fit = lagjax.fit(scene, rows, {"k": 3.8, "late": 0.3}, free={"k": True, "late": per_record})
+    fit = lagjax.fit(SPRING, rows, {"k": 3.8, "late": 0.3}, free={"k": True, "late": per_record})
     assert fit.ok and contains(fit, late=late, k=4.0)
 
 
@@ -222,7 +229,7 @@ def test_heights_of_a_board_that_a_ball_meets():
         return np.select([ts < first, ts < second], arcs[:2], arcs[2])
 
     rows = [lagjax.Record(ts, noisy(bounce(h), k, 1e-3), start=(1.0, 0.0)) for k, h in enumerate(heights)]
-    fit = lagjax.fit(BALL_AND_BOARD, rows, {"h": 0.0, "e": 0.6}, free={"h": per_record, "e": True})
+    fit = lagjax.fit(BALL, rows, {"h": 0.0, "e": 0.6}, free={"h": per_record, "e": True})
     assert fit.ok and contains(fit, h=heights, e=0.7)
 
 
@@ -242,7 +249,7 @@ def test_of_several_systems_those_that_do_not_see_a_number_keep_it():
     both = [lagjax.Record(TS, noisy(0.5 * np.stack([slow + fast, slow - fast], axis=1), k, 1e-3)) for k in range(2)]
     own = [lagjax.Record(TS, noisy(a * slow + o, k, 1e-3)) for k, (a, o) in enumerate(((1.0, 0.1), (0.5, -0.2)))]
     fit = lagjax.fit(
-        {"single": SINGLE, "pair": PAIR}, {"single": own, "pair": both}, {"k": 3.0, "offset": 0.0},
+        {"single": SPRING, "pair": PAIR}, {"single": own, "pair": both}, {"k": 3.0, "offset": 0.0},
         observe={"single": shifted, "pair": None}, free={"k": True, "offset": per_record},
     )  # fmt: skip
     assert fit.ok and fit.covariance.names == ("params['k']", "params['offset'][0]", "params['offset'][1]")
@@ -254,22 +261,13 @@ def test_of_several_systems_those_that_do_not_see_a_number_keep_it():
 
 @pytest.mark.slow
 def test_chaotic_records_in_pieces_have_one_offset_each():
-    def double_pendulum(q, qdot, params):
-        kinetic = qdot[0] ** 2 + 0.5 * params["l"] ** 2 * qdot[1] ** 2
-        kinetic += params["l"] * qdot[0] * qdot[1] * jnp.cos(q[0] - q[1])
-        return kinetic + 9.81 * (2 * jnp.cos(q[0]) + params["l"] * jnp.cos(q[1]))
-
-    scene, ts, truth = (
-        lagjax.System(double_pendulum),
-        np.linspace(0.0, 15.0, 1501),
-        np.array([[0.05, -0.02], [-0.04, 0.03]]),
-    )
+    ts, truth = np.linspace(0.0, 15.0, 1501), np.array([[0.05, -0.02], [-0.04, 0.03]])
     rows = []
     for k, offset in enumerate(truth):
-        q = np.asarray(lagjax.simulate(scene, np.array([2.0, 2.3 + 0.2 * k]), np.zeros(2), ts, {"l": 1.0}).q)
+        q = np.asarray(lagjax.simulate(DOUBLE, np.array([2.0, 2.3 + 0.2 * k]), np.zeros(2), ts, {"l": 1.0}).q)
         rows.append(lagjax.Record(ts, noisy(q + offset, k)))
     free = {"l": True, "offset": per_record}
-    fit = lagjax.fit(scene, rows, {"l": 0.9, "offset": np.zeros(2)}, observe=shifted, free=free)
+    fit = lagjax.fit(DOUBLE, rows, {"l": 0.9, "offset": np.zeros(2)}, observe=shifted, free=free)
     assert fit.ok and "pieces" in fit.message and contains(fit, l=1.0, offset=truth)
 
 

@@ -21,6 +21,24 @@ def step(x, carry, _, row):
     return [behind, later], [jnp.append(behind, later * x[0])], [behind * t + x]
 
 
+@pytest.mark.parametrize("reverse", [False, True])
+def test_loops_and_searches_run_on_the_host(reverse):
+    def function(knots, t, c):
+        found = jnp.searchsorted(knots, t, side="right")
+        last, each = jax.lax.scan(lambda x, row: (0.5 * x + row, x * c), c, t, reverse=reverse)
+        return found, last, each
+
+    rng = np.random.default_rng(0)
+    knots, t = np.sort(rng.normal(size=(3, 100)), axis=1), rng.normal(size=(3, 20))
+    knots[:, 50:52], t[0, :4] = [[-0.0, 0.0]], [0.0, -0.0, np.nan, knots[0, 7]]
+    knots, c = np.sort(knots, axis=1), rng.normal(size=3)
+    host = HostFunction(function, *(jax.ShapeDtypeStruct(x.shape[1:], float) for x in (knots, t, c)))
+    with jax.enable_x64(True):
+        expected = jax.vmap(function)(knots, t, c)
+    for own, plain in zip(host(knots, t, c), expected, strict=True):
+        np.testing.assert_allclose(own, plain, rtol=1e-14)
+
+
 def repeat_by_scan(x, c, t, rows):
     def go(carry, row):
         carry, (of_round,), (part,) = step([x], carry, [], [row])

@@ -24,7 +24,7 @@ from lagjax._fit.model._signals import Signals
 from lagjax._fit.model._timings import Timings, build_clock
 from lagjax._interface import Layout, find_params_expression
 from lagjax._primitives import DOUBLE
-from lagjax._run.hybrid import Hybrid, Scene, first_law, jumps, require_scene
+from lagjax._run.hybrid import Scene, first_law, jumps, require_scene
 
 PyTree = Any
 
@@ -83,18 +83,14 @@ def _assemble_system(given: GivenSystem, parameters: Parameters, law: AbstractNo
         size = np.append(size, max(np.ptp(record.ts) for record in timings.values()))
         sensor = Sensor(*(np.append(x, np.nan) for x in sensor))
     fitted = np.array([record.start is None or isinstance(record.start, Guess) for record in records])
-    manifold = None
-    if isinstance(system, Hybrid) or jumps(system):
-        if fitted.any() and has_constraints(first_law(system)):
-            raise ValueError(
-                "A start on constraints of hybrid motion, or beside contacts, cannot be fitted: give start=(q0, qdot0)."
-            )
-        if isinstance(observe, Delayed):
-            raise ValueError("Sensors of contacts and hybrid motion cannot be lagjax.Delayed: shift the times instead.")
-    elif has_constraints(system) and not input_functions(system):
-        manifold = Manifold(system, layout, parameters, motions.projection)
-    elif has_constraints(system) and fitted.any():
-        raise ValueError("A start on constraints of a scene with `inputs` cannot be fitted: give start=(q0, qdot0).")
+    manifold, scene = None, first_law(system)
+    if jumps(system) and isinstance(observe, Delayed):
+        raise ValueError("Sensors of contacts and hybrid motion cannot be lagjax.Delayed: shift the times instead.")
+    asking = input_functions(scene)
+    if has_constraints(scene) and not any(role.endswith("constraints") for role in asking):
+        manifold = Manifold(scene, layout, parameters, motions.projection, form if asking else None)
+    elif has_constraints(scene) and fitted.any():
+        raise ValueError("A start on constraints that ask for `inputs` cannot be fitted: give start=(q0, qdot0).")
     return SystemResiduals(
         name, system, records, whole_pieces(records), fitted, motions, signals, parameters.restore,
         np.where(size > 0, size, 1.0), DEFAULT_RTOL, clocks, manifold, sensor,
@@ -114,8 +110,6 @@ def _require_motion(given: GivenSystem, recordings: list[Record], signals: Signa
 
 def _read_form(system: Scene, records: list[Record], hold: str) -> InputForm | None:
     asking = input_functions(system)
-    if asking and jumps(system):
-        raise ValueError(f"{asking[0]} asks for `inputs`; hybrid motion and contacts have none: make it one of `t`.")
     for place, record in enumerate(records):
         if asking and (not isinstance(record, Record) or record.input_structure is None):
             none = f"which records[{place}] has none of: give Record(..., inputs=...)."
@@ -139,7 +133,7 @@ def _read_layout(system: Scene, records: list[Record], params0, form: InputForm 
     q, qdot = jax.tree.map(jnp.asarray, begun)
     scene, params = first_law(system), params0
     if form is not None:
-        scene, params = form.drive_scene(scene), form.params(params0, 2)
+        scene, params = form.drive_system(scene), form.params(params0, 2)
     try:
         jax.eval_shape(lambda q, qdot: scene.energy(q, qdot, 0.0, params), q, qdot)
     except Exception as reason:

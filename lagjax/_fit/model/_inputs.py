@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._run.hybrid import Scene, laws
-from lagjax._scene import MARGINS, Driven, System, asking_for_inputs, continued, drive_scene, samples
+from lagjax._run.hybrid import Hybrid, Scene, Transition, laws
+from lagjax._scene import MARGINS, Driven, System, asking_for_inputs, continued, drive_function, drive_scene, samples
 
 PyTree = Any
 _LEAST_ROOM, _GROWTH = 16, 4  # of tables: at most four times what is needed, and six programs up to 16 000 samples
@@ -57,12 +57,15 @@ class InputForm(NamedTuple):
         """The inputs at the time t, by the table of one piece."""
         return self.restore(samples(table.knots, table.values, self.hold)(t))
 
-    def drive_scene(self, system: System) -> System:
+    def drive_system(self, system: System) -> System:
         return drive_scene(system, self, ("t", "params"))
+
+    def drive_scene(self, scene: Scene) -> Scene:
+        return _drive_modes(scene, self) if isinstance(scene, Hybrid) else self.drive_system(scene)
 
     def bind_samples(self, system: Scene, params: PyTree, ts: np.ndarray, inputs: np.ndarray) -> tuple[Scene, PyTree]:
         """The scene with inputs (K, I) sampled at `ts` (K,), and its parameters, as `simulate` takes them."""
-        if not input_functions(system) or not isinstance(system, System):
+        if not input_functions(system):
             return system, params
         table = build_table([(ts, inputs)], self.hold)
         return self.drive_scene(system), Driven(params, SampleTable(table.knots[0], table.values[0]))
@@ -70,6 +73,17 @@ class InputForm(NamedTuple):
     def params(self, params: PyTree, room: int) -> Driven:
         """Parameters of the driven scene, with a table of zeros of this many instants: a structure."""
         return Driven(params, SampleTable(np.arange(float(room)), np.zeros((room, self.size))))
+
+
+@functools.lru_cache(maxsize=16)
+def _drive_modes(scene: Hybrid, form: InputForm) -> Hybrid:
+    drive = functools.partial(drive_function, find_inputs=form, extras=("t", "params"))
+    modes = {name: form.drive_system(mode) for name, mode in scene.modes.items()}
+    transitions = [
+        Transition(one.source, one.target, drive(one.guard), one.direction, one.reset and drive(one.reset), one.fires)
+        for one in scene.transitions
+    ]
+    return Hybrid(modes, transitions, scene.start, scene.max_transitions)
 
 
 def split_leaves(flat, tree, shapes: tuple[tuple[int, ...], ...]) -> PyTree:

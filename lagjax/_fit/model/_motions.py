@@ -25,7 +25,7 @@ import numpy as np
 
 from lagjax._engine import Problem, choose
 from lagjax._engine.taylor import Flow, MachineCode, Motions, flow_of, jvp, project_start_tangents, tolerances_of
-from lagjax._fit.model._inputs import InputForm, SampleTable, input_functions
+from lagjax._fit.model._inputs import InputForm, SampleTable, constant_tables, input_functions
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import start_pair
 from lagjax._interface import ENDED_WELL, Layout, halves
@@ -83,10 +83,10 @@ class AbstractMotions(abc.ABC):
 def choose_motions(
     system: Scene, layout: Layout, parameters: Parameters, rtol: float, form: InputForm | None
 ) -> AbstractMotions:
-    if not isinstance(system, System) or jumps(system):
-        return _JaxMotions(system, layout, parameters, {"rtol": rtol})
     form = form if input_functions(system) else None  # inputs that only sensors ask for, or nothing
     scene = system if form is None else form.drive_scene(system)
+    if not isinstance(scene, System) or jumps(scene):
+        return _JaxMotions(scene, layout, parameters, {"rtol": rtol}, form is not None)
 
     def problem(room: int) -> Problem:
         params = parameters.restore(parameters.example)
@@ -157,7 +157,8 @@ class _JaxMotions(AbstractMotions):
 @functools.lru_cache(maxsize=16)
 def _programs_once(scene: Scene, layout: Layout, tree, leaves: tuple, options: tuple, is_driven: bool):
     """The motions with their tangents and the accelerations of many rows: compiled once for the fits of a scene."""
-    restore = Parameters([np.zeros(*leaf) for leaf in leaves], tree, *np.zeros((3, 0)), (), ()).restore
+    none = np.zeros(0)
+    restore = Parameters([np.zeros(*leaf) for leaf in leaves], tree, none, none, none, (), ()).restore
 
     def scene_params(numbers, table):
         params = restore(numbers)
@@ -219,25 +220,36 @@ class Manifold:
     """The states that satisfy the constraints of a scene: by the projection of its machine code, else by `project`. The
     first, a step of Newton's method that is taken until nothing changes, needs no compilation."""
 
-    def __init__(self, system: System, layout: Layout, parameters: Parameters, projection: Projection | None):
-        def project(y: jax.Array, t, numbers) -> jax.Array:
+    def __init__(
+        self, system: System, layout: Layout, parameters: Parameters, projection: Projection | None,
+        form: InputForm | None = None,
+    ):  # fmt: skip
+        """`form` is that of the inputs of a scene that asks for them, but not in its constraints."""
+        scene = system if form is None else form.drive_system(system)
+
+        def project(y: jax.Array, t, numbers, table) -> jax.Array:
             q, qdot = map(layout.restore, halves(y))
-            q, qdot = system.project(q, qdot, t, parameters.restore(numbers))
+            params = parameters.restore(numbers)
+            q, qdot = scene.project(q, qdot, t, params if form is None else Driven(params, table))
             return jnp.concatenate([layout.flatten(q), layout.flatten(qdot)])
 
-        def project_with_derivatives(y, t, numbers):
-            return project(y, t, numbers), *jax.jacfwd(project, argnums=(0, 2))(y, t, numbers)
+        def project_with_derivatives(*arguments):
+            return project(*arguments), *jax.jacfwd(project, argnums=(0, 2))(*arguments)
 
         self._project = jax.jit(project_with_derivatives)  # one by one: compilation for many rows takes seconds
         self.projection, self.dtype = projection, layout.dtype
 
-    def project(self, y: np.ndarray, t: np.ndarray, numbers: np.ndarray, directions: np.ndarray) -> tuple:
+    def project(
+        self, y: np.ndarray, t: np.ndarray, numbers: np.ndarray, directions: np.ndarray, inputs: np.ndarray
+    ) -> tuple:
         """Consistent states near `y` (N, 2n) at the times `t` (N,), NaN without one, with their derivatives by y (N,
-        2n, 2n) and along directions (N, L, P) of the parameters (N, P), which are (N, L, 2n)."""
+        2n, 2n) and along directions (N, L, P) of the parameters (N, P), which are (N, L, 2n); `inputs` (N, I) are those
+        at these times."""
         if self.projection is not None:
             return _project_by_newton(self.projection, y, t, numbers, directions)
-        y, t, numbers = (np.asarray(x, self.dtype) for x in (y, t, numbers))
-        rows = [self._project(*row) for row in zip(y, t, numbers, strict=True)]
+        table = constant_tables(t, inputs)
+        y, t, numbers, *table = (np.asarray(x, self.dtype) for x in (y, t, numbers, *table))
+        rows = [self._project(*row, SampleTable(k, v)) for *row, k, v in zip(y, t, numbers, *table, strict=True)]
         starts, by_y, by_numbers = (np.stack([np.asarray(x, float) for x in part]) for part in zip(*rows, strict=True))
         return starts, by_y, np.einsum("nip,nlp->nli", by_numbers, directions)
 

@@ -187,7 +187,7 @@ class Parameters:
         return matrix
 
     @functools.cached_property
-    def _seen(self) -> tuple[np.ndarray, ...]:
+    def _derivative_places(self) -> tuple[np.ndarray, ...]:
         """The places of derivatives in `directions`, (record, column, number), and which of `_slopes` each is."""
         rows, columns, _ = self._slopes(self.inverse(self.first))
         found = []
@@ -202,7 +202,7 @@ class Parameters:
     def directions(self, u: np.ndarray) -> np.ndarray:
         """The derivatives of the numbers of every record by the unknowns that these depend on, (R, L, P)."""
         found = np.zeros((*self.unknowns.columns.shape, self.places.shape[1]))
-        *places, which = self._seen
+        *places, which = self._derivative_places
         found[tuple(places)] = self._slopes(u)[2][which]
         return found
 
@@ -395,7 +395,7 @@ class Unknowns(NamedTuple):
     def norms(self, lengths: np.ndarray) -> np.ndarray:
         """The lengths (F,) of the columns of all unknowns from those of records (R, L), also where squares are no
         numbers."""
-        largest, total = np.zeros((2, self.count + 1))
+        largest, total = np.zeros(self.count + 1), np.zeros(self.count + 1)
         np.maximum.at(largest, self.columns, lengths)
         unit = np.where(largest > 0, largest, 1.0)
         np.add.at(total, self.columns, (lengths / unit[self.columns]) ** 2)
@@ -413,7 +413,7 @@ class Unknowns(NamedTuple):
         return found.reshape(len(owners), -1, rows.shape[-1])
 
     @property
-    def of_owners(self) -> np.ndarray:
+    def owner_columns(self) -> np.ndarray:
         """The columns of each owner (O, own), in the order of `stack_by_owner`."""
         return self.columns[np.unique(self.owners, return_index=True)[1], : self.own]
 

@@ -39,7 +39,7 @@ from lagjax._fit.model._timings import Clock
 from lagjax._interface import Layout, halves
 from lagjax._run import simulate
 from lagjax._run.hybrid import Scene
-from lagjax._scene import Driven, System
+from lagjax._scene import Driven
 
 
 class Point(NamedTuple):
@@ -210,7 +210,11 @@ class SystemResiduals:
             assert self.manifold is not None and trial.across is not None
             some, tangents = self.fitted, np.tile(np.eye(states), (len(starts), 1, 1))
             t = np.array([self.records[piece.record].ts[piece.places[0]] for piece in self.pieces])
-            consistent = self.manifold.project(starts[some], t[some], numbers[some], directions[some])
+            inputs = np.zeros((len(starts), self.batches[0].inputs.shape[-1]))
+            for batch in self.batches:
+                inputs[batch.rows] = batch.inputs[:, 0]
+            each = (x[some] for x in (starts, t, numbers, directions, inputs))
+            consistent = self.manifold.project(*each)
             starts[some], tangents[some], starts_dot[some] = consistent
             if (lost := ~np.isfinite(starts).all(axis=1)).any():
                 raise self.lost(np.argmax(lost), "No start near the one that was tried satisfies the constraints.")
@@ -311,7 +315,7 @@ class SystemResiduals:
         layout, signals, kind = self.layout, self.signals, numbers.dtype
         record = self.pieces[batch.rows[0]].record
         form = signals.form if signals.form is not None and input_functions(self.scene) else None
-        scene = form.drive_scene(self.scene) if form is not None and isinstance(self.scene, System) else self.scene
+        scene = self.scene if form is None else form.drive_scene(self.scene)
 
         def sense(ts, y0, numbers, inputs, table):
             q, qdot = map(layout.restore, halves(y0))

@@ -62,7 +62,8 @@ class AbstractTransform(abc.ABC):
     def slopes(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The entries of ∂x/∂u that are not zero by construction: rows, columns, and values."""
         matrix = self.jacobian(u)
-        return *(places.ravel() for places in np.indices(matrix.shape)), matrix.ravel()
+        rows, columns = np.indices(matrix.shape)
+        return rows.ravel(), columns.ravel(), matrix.ravel()
 
     @abc.abstractmethod
     def inverse(self, x: np.ndarray) -> np.ndarray:

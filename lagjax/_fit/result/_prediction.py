@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
+from lagjax._equations import has_constraints
 from lagjax._fit.model._noise import KnownNoise, NoiseScale
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import (
@@ -34,6 +35,7 @@ from lagjax._fit.result._information import (
 from lagjax._fit.search._descent import minimise
 from lagjax._fit.search._reader import build_reader, read_start
 from lagjax._run import Trajectory, simulate
+from lagjax._run.hybrid import first_law
 
 PyTree = Any
 
@@ -90,6 +92,8 @@ def predict_record(fit, record: Record, system: str | None) -> Prediction:
     is_fitted = state is None or isinstance(record.start, Guess)
     if state is None:
         state = read_start(build_reader(record, part, about.numbers), record, part, "This record")
+    if is_fitted and part.manifold is None and has_constraints(first_law(part.scene)):
+        raise ValueError("The start of this record lies on constraints that ask for `inputs`: give start=(q0, qdot0).")
     fixed = part.with_records([record], np.array([is_fitted]), part.manifold)
     moves = np.isin(np.arange(len(about.u)), about.own)
     residuals, point = Residuals([fixed], about.parameters.fix(about.u, ~moves)), Point(about.u[moves], state[None])

@@ -185,9 +185,9 @@ def _limited_step(rows: np.ndarray, of_u: np.ndarray, damping: float, pull, unkn
 def _damped_step(rows: np.ndarray, damping: np.ndarray, pull, unknowns: Unknowns) -> np.ndarray:
     """δu (F,) that minimises |rows (δu, 1)|² + |pull|² + |damping δu|²: the numbers of records, each behind its rows
     (O, M, L + 1), are eliminated from those that all share."""
-    own, shared, alone = unknowns.own, unknowns.shared, unknowns.of_owners
+    own, shared, alone = unknowns.own, unknowns.shared, unknowns.owner_columns
 
-    def beside(places: np.ndarray) -> np.ndarray:
+    def regular_rows(places: np.ndarray) -> np.ndarray:
         """The rows of damping and pull of the unknowns at `places` (..., K), and their residuals: (..., 2 K, K + 1)."""
         weights, count = [np.append(x, 1.0)[places] for x in (damping, pull[0])], places.shape[-1]
         found = np.zeros((*places.shape[:-1], 2 * count, count + 1))
@@ -199,10 +199,10 @@ def _damped_step(rows: np.ndarray, damping: np.ndarray, pull, unknowns: Unknowns
     r = rows
     if own:
         more = np.zeros((len(rows), 2 * own, rows.shape[-1]))
-        more[..., [*range(own), -1]] = beside(alone)
+        more[..., [*range(own), -1]] = regular_rows(alone)
         r = qr_triangle(np.concatenate([rows, more], axis=1))
     rest = compress_rows(r[:, own:, own:].reshape(1, -1, len(shared) + 1))[0]
-    triangle = qr_triangle(np.concatenate([rest, beside(shared)]))
+    triangle = qr_triangle(np.concatenate([rest, regular_rows(shared)]))
     du = np.zeros(unknowns.count + 1)
     du[shared] = np.linalg.solve(triangle[: len(shared), : len(shared)], -triangle[: len(shared), -1])
     if own:

@@ -88,7 +88,7 @@ class Transition(eqx.Module):
         self.source, self.target, self.direction, self.fires = source, target, int(direction), fires
         known = isinstance(guard, Function)
         self.guard = guard if known else accept(guard, "guard", extras=("t", "params", "multipliers"))
-        self.reset = None if reset is None else accept(reset, "reset")
+        self.reset = reset if reset is None or isinstance(reset, Function) else accept(reset, "reset")
 
     def __repr__(self) -> str:
         way = {-1: "falls through", 0: "passes", 1: "rises through"}[self.direction]
