@@ -192,7 +192,7 @@ def test_check_and_health_compile_nothing_where_there_are_programs(monkeypatch):
         raise AssertionError("compiled by XLA")
 
     monkeypatch.setattr(many_states, "_evaluate_compiled", compiled)
-    monkeypatch.setattr(of_check, "_variation", compiled)
+    monkeypatch.setattr(of_check, "_acceleration_slopes", compiled)
     monkeypatch.setattr(of_health, "_measure_traced", compiled)
     for make in (scenes.rolling_cylinder, scenes.damped_driven_oscillator):
         scene = make()
