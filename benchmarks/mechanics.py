@@ -3,13 +3,17 @@
     python -m benchmarks.mechanics --write       # benchmarks/results/mechanics.json; LAGJAX_CACHE=off keeps nothing
 
 An arm with eight joints (`examples/robot_arm.urdf`), and a floating base on six legs: 24 coordinates. Inertias are
-parameters. CPU seconds; `first` with all compilation, `twenty` are the first twenty calls together. Where pinocchio is
-installed (`pip install pin`) it takes the same states, called from Python. Errors are those from pinocchio or, without
-it, from L by JAX's own derivatives.
+parameters. CPU seconds; `first` with all compilation, `twenty` are the first twenty calls together. Where pinocchio and
+casadi are installed (`pip install pin casadi`) they take the same states, called from Python; CasADi's functions are C
+by `cc -O2`, for their own inertias. Errors are those from pinocchio or, without it, from L by JAX's own derivatives.
 """
 
 import argparse
+import contextlib
 import importlib.util
+import shutil
+import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -66,7 +70,7 @@ def measure(source: str | Path) -> Iterator[dict[str, Any]]:
     """A row for each quantity."""
     of = robot.read(source)
     scene, params, n = robot.system(of), robot.parameters(of), len(of.moving)
-    q, v = jnp.asarray(np.random.default_rng(0).uniform(-1.0, 1.0, (2, n)))
+    q, v, a = jnp.asarray(np.random.default_rng(0).uniform(-1.0, 1.0, (3, n)))
 
     def acceleration(q, v):
         return scene.acceleration(q, v, params=params)
@@ -85,6 +89,7 @@ def measure(source: str | Path) -> Iterator[dict[str, Any]]:
         f"acceleration of {MEMBERS}": (
             jax.jit(lambda q, v: jax.vmap(acceleration)(jnp.tile(q, (MEMBERS, 1)), jnp.tile(v, (MEMBERS, 1)))), MEMBERS
         ),
+        "inverse dynamics": (jax.jit(lambda q, v: lagjax.inverse_dynamics(scene, q, v, a, params=params)), 1),
         "linearize": (lambda q, v: lagjax.linearize(scene, q, v, params), 1),
     }  # fmt: skip
     for name, (call, each) in calls.items():
@@ -97,10 +102,83 @@ def measure(source: str | Path) -> Iterator[dict[str, Any]]:
             "robot": of.name, "n": n, "quantity": name, "first s": first, "second µs": 1e6 * second / each,
             "twenty s": twenty, "again µs": 1e6 * again, "error": error,
         }  # fmt: skip
-    if importlib.util.find_spec("pinocchio"):
-        theirs = robot.Pinocchio(source, of)
-        again = spend(lambda: theirs.acceleration(q, v), CALLS)
-        yield {"robot": of.name, "n": n, "quantity": "acceleration by pinocchio", "again µs": 1e6 * again}
+    for name, call in peers(of, source, *map(np.asarray, (q, v, a))):
+        again = min(spend(call, CALLS) for _ in range(5))
+        yield {"robot": of.name, "n": n, "quantity": name, "again µs": 1e6 * again}
+
+
+def peers(of, source, q, v, a) -> Iterator[tuple[str, Callable]]:
+    """What others that are installed take for a state that is ready in their form; damping is left out."""
+    if not importlib.util.find_spec("pinocchio"):
+        return
+    theirs = robot.Pinocchio(source, of)
+    pin, given = theirs.pin, (theirs.model, theirs.data, *theirs._state(q, v, a))
+    yield "acceleration by pinocchio", lambda: pin.aba(*given)
+    yield "Jacobian by pinocchio", lambda: pin.computeABADerivatives(*given)
+    yield "inverse dynamics by pinocchio", lambda: pin.rnea(*given)
+    if importlib.util.find_spec("casadi") and shutil.which("cc"):
+        yield from compile_casadi(of)
+
+
+def compile_casadi(of: robot.Robot) -> Iterator[tuple[str, Callable]]:
+    """CasADi's accelerations and inverse dynamics of the same L, as C that is called with buffers."""
+    import casadi  # pyright: ignore[reportMissingImports]
+
+    n = len(of.moving)
+    q, v, a = (casadi.SX.sym(name, n) for name in ("q", "v", "a"))
+    energy = lagrangian_in_casadi(of, q, v)
+    momentum = casadi.gradient(energy, v)
+    taken = casadi.jtimes(momentum, casadi.vertcat(q, v), casadi.vertcat(v, a)) - casadi.gradient(energy, q)
+    free, mass = casadi.substitute(taken, a, casadi.SX.zeros(n)), casadi.jacobian(momentum, v)
+    formulas = {
+        "inverse dynamics": taken,
+        "acceleration": casadi.ldl_solve(-free, *casadi.ldl(mass, False)[:2], range(n)),
+    }
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        for name, formula in formulas.items():
+            function, given = casadi.Function("of", [q, v, a], [formula]), [np.full(n, 0.1) for _ in range(3)]
+            function.generate("of.c")
+            library = f"{folder}/{name[:3]}.so"
+            subprocess.run(["cc", "-O2", "-fPIC", "-shared", "of.c", "-o", library], check=True)
+            buffer, work = casadi.external("of", library).buffer()
+            result = np.zeros(n)
+            for i, array in enumerate(given):
+                buffer.set_arg(i, array.data)
+            buffer.set_res(0, result.data)
+            yield f"{name} by CasADi", work
+
+
+def lagrangian_in_casadi(of: robot.Robot, q, v):
+    """`examples.robot._lagrangian` in CasADi."""
+    import casadi  # pyright: ignore[reportMissingImports]
+
+    still, total, k = casadi.SX.zeros(3), 0.0, 0
+    state = {of.root: (still, still, casadi.SX([0.0, 0.0, 1.0]), 0.0)}
+    for joint in of.joints:
+        omega, speed, up, height = state[joint.parent]
+        axis, turn, offset = casadi.SX(joint.axis), casadi.SX(joint.rotation), casadi.SX(joint.offset)
+        moves = joint.kind in robot.MOVING
+        if joint.kind == "prismatic":
+            offset += turn @ axis * q[k]
+        elif moves:
+            along = axis @ axis.T
+            turn = turn @ (along + casadi.cos(q[k]) * (casadi.SX.eye(3) - along) + casadi.sin(q[k]) * casadi.skew(axis))
+        height, up = height + casadi.dot(up, offset), turn.T @ up
+        speed, omega = turn.T @ (speed + casadi.cross(omega, offset)), turn.T @ omega
+        if joint.kind == "prismatic":
+            speed += axis * v[k]
+        elif moves:
+            omega += axis * v[k]
+        k += moves
+        state[joint.child] = omega, speed, up, height
+        if body := of.bodies.get(joint.child):
+            centre = casadi.SX(body.centre)
+            w = speed + casadi.cross(omega, centre)
+            turning = casadi.dot(omega, casadi.SX(body.inertia) @ omega)
+            total += 0.5 * (body.mass * casadi.dot(w, w) + turning) - body.mass * robot.G * (
+                height + casadi.dot(up, centre)
+            )
+    return total
 
 
 def reference(of, source, q, v, params):

@@ -309,6 +309,10 @@ class Pinocchio:
         """Its `nle`, in our order."""
         return self.pin.nle(self.model, self.data, *self._state(q, qdot))[self.order]
 
+    def forces(self, q, qdot, qddot):
+        """τ by its recursive Newton–Euler algorithm, with what the damping of the file takes."""
+        return self.pin.rnea(self.model, self.data, *self._state(q, qdot, qddot))[self.order] + self.damping * qdot
+
     def acceleration(self, q, qdot):
         """q̈ by its articulated-body algorithm, with the damping of the file."""
         return self.pin.aba(self.model, self.data, *self._state(q, qdot, -self.damping * qdot))[self.order]

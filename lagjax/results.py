@@ -45,7 +45,7 @@ from lagjax._trust.health import Health
 __all__ = [
     "Animation", "CanonicalTrajectory", "ChangedCoordinates", "Comparison", "Conserved", "ConservedQuantities",
     "ContactChanges", "Crossings", "Equations", "Equilibrium", "Experiments", "Explanation", "Family", "Finding",
-    "Findings", "Fit", "Hamiltonian", "Health", "Impacts", "Linearization", "LyapunovExponent", "Modes", "Orbit", "Path",
-    "Prediction", "Profile", "ReducedLinearization", "Routhian", "SameMotion", "State", "Status", "SteadyMotion",
-    "Summary", "Trajectory", "Transitions", "WorkPrecision", "WorkPrecisionRow",
+    "Findings", "Fit", "Hamiltonian", "Health", "Impacts", "Linearization", "LyapunovExponent", "Modes", "Orbit",
+    "Path", "Prediction", "Profile", "ReducedLinearization", "Routhian", "SameMotion", "State", "Status",
+    "SteadyMotion", "Summary", "Trajectory", "Transitions", "WorkPrecision", "WorkPrecisionRow",
 ]  # fmt: skip

@@ -4,6 +4,7 @@ import gc
 import hashlib
 import itertools
 import os
+import threading
 from importlib.metadata import version
 from pathlib import Path
 
@@ -50,6 +51,21 @@ jax.config.update("jax_compilation_cache_dir", str(COMPILED))
 os.environ["LAGJAX_CACHE"] = str(COMPILED.parent.parent / "objects")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+# For every program JAX makes a context of MLIR, with all dialects in it, and keeps it: of the 18 ms and the 1.3 MB that
+# one of a single operation takes, 7 ms and 1.2 MB. Here each thread has one for all of its programs.
+if version("jax").startswith("0.10."):
+    from jax._src.interpreters import mlir
+
+    _make_context, _kept = mlir.make_ir_context, threading.local()
+
+    def _context_of_thread():
+        if not hasattr(_kept, "context"):
+            _kept.context = _make_context()
+        return _kept.context
+
+    mlir.make_ir_context = _context_of_thread
 
 
 # Machine code is made fast instead of well, too. What selects instructions is what does at other levels, since LLVM's

@@ -254,16 +254,17 @@ _TINY = 1e-6  # of the other multipliers: one that counts as their rounding
 
 class Steady(NamedTuple):
     """A motion that is sought: the `cyclic` coordinates (n,), of which velocities are unknown and not the place; the
-    unknowns (n,) that are `held`; and the matrices Ω of velocities that turn with each coordinate (n, n, n)."""
+    unknowns (n,) that are `held`; `moves` (n, n) and `turns` (n, n, n) are those of `SteadySymmetries`."""
 
     cyclic: Bool[Array, " n"]
     held: Bool[Array, " n"]
+    moves: Float[Array, "n n"]
     turns: Float[Array, "n n n"]
 
     def state(self, scene: SceneState, x: Vector) -> tuple[Vector, Vector]:
         """(q, q̇) by the unknowns (n,)."""
         x = jnp.where(self.held, jnp.where(self.cyclic, scene.qdot, scene.q), x)
-        return jnp.where(self.cyclic, scene.q, x), jnp.where(self.cyclic, x, 0)
+        return jnp.where(self.cyclic, scene.q, x), self.moves @ jnp.where(self.cyclic, x, 0)
 
 
 @compile_for_one_call

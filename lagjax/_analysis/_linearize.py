@@ -118,7 +118,7 @@ class Linearization(NamedTuple):
         n, a, rows = len(self.names), self.A, self.allowed
         if motion is not None:
             layout = Layout.from_state(motion.q, motion.qdot)
-            a, rows = _remove_symmetries(a, rows, layout.flatten(motion.qdot), motion.turns)
+            a, rows = _remove_symmetries(a, rows, layout.flatten(motion.qdot), motion.moves, motion.turns)
             cyclic = np.concatenate([np.ravel(x) for x in jax.tree.leaves(motion.cyclic)])
             rows = rows[np.append(np.ones(len(self.allowed), bool), cyclic)]
         rank = 2 * n - null_space(np.asarray(rows)).shape[1] if is_known(rows) else len(rows)
@@ -152,11 +152,11 @@ class ReducedLinearization(NamedTuple):
 
 
 @compile_for_one_call
-def _remove_symmetries(a: Array, rows: Array, qdot: Vector, turns: Array) -> tuple[Array, Array]:
+def _remove_symmetries(a: Array, rows: Array, qdot: Vector, moves: Array, turns: Array) -> tuple[Array, Array]:
     """A in a frame that turns with a steady motion, and rows (k + n, 2n) whose last ones, one for each coordinate that
     is cyclic, are zero for what is orthogonal to a deviation along it."""
     spin = jnp.einsum("i,ijk", qdot, turns.astype(a.dtype))
-    moved = jnp.hstack([jnp.eye(len(qdot), dtype=a.dtype), turns.astype(a.dtype) @ qdot])
+    moved = jnp.hstack([moves.T.astype(a.dtype), turns.astype(a.dtype) @ qdot])
     return a - jnp.kron(jnp.eye(2, dtype=a.dtype), spin), jnp.concatenate([rows, moved])
 
 

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from lagjax._analysis._equilibrium import Steady, find_balance
 from lagjax._analysis._scene_state import SceneState, require_matrices
@@ -23,7 +23,9 @@ class SteadyMotion(NamedTuple):
     - `q`, `qdot`: the state, in the user's pytree; NaN where no steady motion was found.
     - `multipliers`: λ there, in the structure the constraints return; None without constraints.
     - `ok`: whether a steady motion was found.
-    - `cyclic`: which coordinates are cyclic, in the structure of q; the others are constant.
+    - `cyclic`: which coordinates are cyclic, in the structure of q; of coordinates that move together, as those of
+      rotors that springs couple, it is one. The others are constant, or move with these.
+    - `moves` (n, n): with the cyclic coordinate i the others move by `moves[:, i]`, itself by 1.
     - `turns` (n, n, n): `turns[i]` is the matrix Ω by which velocities turn with the cyclic coordinate i: all but zero
       is that of a yaw, with which the velocity of a place turns.
     """
@@ -33,7 +35,8 @@ class SteadyMotion(NamedTuple):
     multipliers: PyTree
     ok: Bool[Array, ""]
     cyclic: PyTree
-    turns: Float[Array, "n n n"]
+    moves: Any
+    turns: Any
 
     _repr_pretty_ = show_str
 
@@ -100,33 +103,41 @@ def steady_motion(
     require_matrices(n, "A steady motion", "Follow the motion by simulate until it is steady.")
     scene = SceneState.from_state(system, q, qdot, params)
     scene.require_autonomous("A steady motion")
-    cyclic, turns = find_symmetries(scene)
-    steady = Steady(jnp.asarray(cyclic), jnp.asarray(_held(scene, cyclic, hold)), jnp.asarray(turns, scene.q.dtype))
+    chosen = _chosen(scene, hold)
+    cyclic, moves, turns = find_symmetries(scene, chosen[1])
+    held = _held(scene, chosen, cyclic, moves)
+    steady = Steady(jnp.asarray(cyclic), jnp.asarray(held), *(jnp.asarray(x, scene.q.dtype) for x in (moves, turns)))
     place, rate, multipliers, ok = find_balance(scene, steady)
     if throw and scene.concrete and not ok:
         raise ValueError(_explain_failure(scene, cyclic, hold))
     of_user = scene.system._split_by_constraint(multipliers, scene.layout, scene.params) if scene.constrained else None
     restore = scene.layout.restore
-    return SteadyMotion(restore(place), restore(rate), of_user, ok, restore(cyclic), turns)
+    return SteadyMotion(restore(place), restore(rate), of_user, ok, restore(cyclic), moves, turns)
 
 
-def _held(scene: SceneState, cyclic: np.ndarray, hold: Any) -> np.ndarray:
-    """The unknowns (n,) that are held: velocities of `cyclic` coordinates, places of the others."""
+def _chosen(scene: SceneState, hold: Any) -> np.ndarray:
+    """The coordinates and the velocities (2, n) that `hold` names. Raises `ValueError` for other names."""
     names = scene.layout.names
-    rates = tuple(f"qdot{name.removeprefix('q')}" for name in names)
-    held = np.zeros(len(names), bool)
+    both = names, tuple(f"qdot{name.removeprefix('q')}" for name in names)
+    chosen = np.zeros((2, len(names)), bool)
     for wanted in (hold,) if isinstance(hold, str) else hold or ():
-        chosen = [[_names(name, wanted) for name in of] for of in (names, rates)]
-        if not isinstance(wanted, str) or not np.any(chosen):
-            raise ValueError(f"hold names {wanted!r}, and the numbers are {', '.join((*names, *rates)[:24])}.")
-        for k in np.flatnonzero(chosen[1] & ~cyclic):
-            if scene.concrete and scene.qdot[k] != 0:
-                raise ValueError(
-                    f"{rates[k]} cannot be held at {scene.qdot[k]}: something depends on {names[k]}, which is constant "
-                    "in a steady motion."
-                )
-        held |= np.where(cyclic, chosen[1], chosen[0])
-    return held
+        named = np.array([[_names(name, wanted) for name in of] for of in both])
+        if not named.any():
+            raise ValueError(f"hold names {wanted!r}, and the numbers are {', '.join(sum(both, ())[:24])}.")
+        chosen |= named
+    return chosen
+
+
+def _held(scene: SceneState, chosen: np.ndarray, cyclic: np.ndarray, moves: np.ndarray) -> np.ndarray:
+    """The unknowns (n,) that are held: velocities of `cyclic` coordinates, places of the others."""
+    for k in np.flatnonzero(chosen[1] & ~moves.any(axis=1)):
+        if scene.concrete and scene.qdot[k] != 0:
+            name = scene.layout.names[k]
+            raise ValueError(
+                f"qdot{name.removeprefix('q')} cannot be held at {scene.qdot[k]}: something depends on {name}, which "
+                "is constant in a steady motion."
+            )
+    return np.where(cyclic, chosen[1], chosen[0])
 
 
 def _names(name: str, wanted: Any) -> bool:

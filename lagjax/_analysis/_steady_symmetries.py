@@ -1,11 +1,12 @@
-"""The coordinates along which a scene looks the same at every place, also where velocities have to turn with them.
+"""The directions along which a scene looks the same at every place, also where velocities have to turn with them.
 
-Coordinate i is cyclic if a matrix Ω of the velocities of those that nothing reads leaves all as it is,
+A direction d of the coordinates is one if a matrix Ω of the velocities of those that nothing reads leaves all as it is,
 
-    ∂L/∂qᵢ + p·Ωq̇ = 0,   ∂Q/∂qᵢ + (∂Q/∂q̇) Ωq̇ + ΩᵀQ = 0,   ∂f/∂qᵢ = 0,   ∂a/∂qᵢ + (∂a/∂q̇) Ωq̇ = 0 where a = 0
+    ∂L/∂q d + p·Ωq̇ = 0,   ∂Q/∂q d + (∂Q/∂q̇) Ωq̇ + ΩᵀQ = 0,   ∂f/∂q d = 0,   ∂a/∂q d + (∂a/∂q̇) Ωq̇ = 0 where a = 0
 
-Ω is zero for the angle of a wheel and for the place of its contact; with its yaw the velocity of that place turns. The
-equations are linear in Ω. They are tested at random states, as they hold everywhere or nowhere.
+Ω is zero for the angle of a wheel and for the place of its contact; with its yaw the velocity of that place turns. Most
+directions are single coordinates; rotors that springs couple turn together. The equations are linear in d and Ω. They
+are tested at random states, as they hold everywhere or nowhere.
 """
 
 from typing import NamedTuple
@@ -14,7 +15,7 @@ import jax
 import numpy as np
 
 from lagjax._analysis._scene_state import SceneState
-from lagjax._equations import Sample, decide
+from lagjax._equations import Sample, decide, echelon_form
 from lagjax._interface import halves, is_concrete
 
 # States, beside two for each number of Ω, and the numbers of Ω up to which it is sought: of more coordinates that
@@ -28,9 +29,11 @@ _DIFFERENTIATED = "nonconservative_force", "residual"
 
 
 class SteadySymmetries(NamedTuple):
-    """The `cyclic` coordinates (n,), and the matrix Ω of velocities that turn with each coordinate, (n, n, n)."""
+    """The `cyclic` coordinates (n,), one for each direction. With a cyclic coordinate i others move as `moves[:, i]`
+    (n, n) says, itself by 1, and velocities turn by Ω = `turns[i]` (n, n, n)."""
 
     cyclic: np.ndarray
+    moves: np.ndarray
     turns: np.ndarray
 
 
@@ -47,8 +50,9 @@ class _Terms(NamedTuple):
     rate_by_qdot: np.ndarray
 
 
-def find_symmetries(scene: SceneState) -> SteadySymmetries:
-    """The symmetries about the state of a scene; where its numbers are traced, about random ones."""
+def find_symmetries(scene: SceneState, preferred: np.ndarray) -> SteadySymmetries:
+    """The symmetries about the state of a scene; where its numbers are traced, about random ones. Of coordinates that
+    move together a `preferred` one (n,) is cyclic."""
     n, random = scene.layout.size, np.random.default_rng(2)
     params = jax.tree.map(
         lambda x: x if is_concrete(x) else random.uniform(0.3, 1.2, x.shape).astype(x.dtype), scene.params
@@ -72,7 +76,8 @@ def find_symmetries(scene: SceneState) -> SteadySymmetries:
             "The Lagrangian, a force or a constraint, or a derivative of it, is not finite at most states about "
             "(q, qdot): give a state in the middle of where motions take place."
         )
-    return _solve_identities(_Terms(*(x[well] for x in terms)), states[1][well], consistent[well])
+    units = of_q * np.where(preferred, 1.0, 1e3)
+    return _solve_identities(_Terms(*(x[well] for x in terms)), states[1][well], consistent[well], of_q, units)
 
 
 def _terms(scene: SceneState, params, steps: tuple, q: np.ndarray, qdot: np.ndarray) -> tuple[_Terms, np.ndarray]:
@@ -98,8 +103,9 @@ def _terms(scene: SceneState, params, steps: tuple, q: np.ndarray, qdot: np.ndar
     return _Terms(by_q, momentum, force, force_by_q, force_by_qdot, jacobian[:, :count], *of_rates), residual[:, count:]
 
 
-def _solve_identities(of: _Terms, qdot: np.ndarray, consistent: np.ndarray) -> SteadySymmetries:
-    """The symmetries by terms at states with velocities `qdot` (S, n), which for those of a are `consistent`."""
+def _solve_identities(of: _Terms, qdot, consistent, of_q, units) -> SteadySymmetries:
+    """The symmetries by terms at states with velocities `qdot` (S, n), which for those of a are `consistent`; `of_q`
+    (n,) are sizes of coordinates, and that with the largest of the `units` (n,) is taken where some move together."""
     n = qdot.shape[1]
     right = [x.reshape(-1, n) for x in (of.lagrangian_by_q, of.force_by_q, of.place_by_q, of.rate_by_q)]
     unread = np.logical_and.reduce([(x == 0).all(axis=0) for x in right])
@@ -111,16 +117,24 @@ def _solve_identities(of: _Terms, qdot: np.ndarray, consistent: np.ndarray) -> S
     of_force = of_force + of.force[:, None, turning, None] * np.eye(n)[:, None, turning]
     of_place = np.zeros((*of.place_by_q.shape[:2], len(turning), len(turning)))
     of_rates = of.rate_by_qdot[:, :, turning, None] * consistent[:, None, None, turning]
-    parts = [x.reshape(-1, len(turning) ** 2) for x in (of_l, of_force, of_place, of_rates)]
-    left, right = np.concatenate(parts), -np.concatenate(right)
+    of_turns = of_l, of_force, of_place, of_rates
+    parts = [x.reshape(len(y), len(turning) ** 2) for x, y in zip(of_turns, right, strict=True)]
+    left, right = np.concatenate(parts), -np.concatenate(right) * of_q
     sizes = np.maximum(np.abs(left).max(axis=1, initial=0), np.abs(right).max(axis=1))
     left, right = (x[sizes > 0] / sizes[sizes > 0, None] for x in (left, right))
     found = np.zeros((len(turning) ** 2, n))
     if left.size:
         found = np.linalg.lstsq(left, right, rcond=_SINGULAR)[0]
-    cyclic = np.abs(left @ found - right).max(axis=0, initial=0) <= _CANCELS
-    turns, among = np.zeros((n, n, n)), np.ix_(np.arange(n), turning, turning)
-    turns[among] = (cyclic * found).T.reshape(n, len(turning), len(turning))
+    # Columns that nothing but Ω balances are single directions; others may balance each other.
+    null = decide(left @ found - right, absolute=_CANCELS * len(left) ** 0.5).null if len(left) else np.eye(n)
+    directions = echelon_form((null * (of_q / units)[:, None]).T) * units  # by rows, in the user's units
+    pivots = np.array([int(np.argmax(np.abs(row / units))) for row in directions], int)
+    cyclic, moves, turns = np.zeros(n, bool), np.zeros((n, n)), np.zeros((n, n, n))
+    cyclic[pivots] = True
+    directions = directions / directions[np.arange(len(pivots)), pivots][:, None]
+    moves[:, pivots] = directions.T
+    among = len(turning), len(turning)
+    turns[np.ix_(pivots, turning, turning)] = (directions / of_q @ found.T).reshape(len(pivots), *among)
     # Of a matrix that is known to ten digits, what is nothing beside its largest entry is nothing.
     turns[np.abs(turns) <= _CANCELS * np.abs(turns).max(initial=0)] = 0.0
-    return SteadySymmetries(cyclic, turns)
+    return SteadySymmetries(cyclic, moves, turns)

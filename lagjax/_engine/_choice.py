@@ -48,9 +48,10 @@ def choose(problem: Problem, requested: AbstractEngine | None = None, members: i
             return Choice(_MACHINE_CODE, None)
         if requested is not None:
             raise ValueError(_refusal(refusal))
-        engine = _import_diffrax()()
+        requested = _import_diffrax()()
     else:
-        engine, refusal = requested, "diffrax was asked for"
+        refusal = "diffrax was asked for"
+    engine: Any = requested
     if sentence := engine.refuses(problem) or engine.lacks_memory(problem, members):
         raise ValueError(f"{sentence}.")
     return Choice(engine, refusal)

@@ -355,7 +355,8 @@ class Accelerations:
         shapes, ends = [self.of.shape(name) for name in _MATRICES], [len(self.of.filled["mass_matrix"])]
         places = [np.divmod(self.of.filled[name], self.layout.size) for name in _MATRICES]
         samples = [np.split(x, ends) for x in self._entries.evaluate_many(columns).T if np.isfinite(x).all()]
-        return [tuple(map(_Entries, of, places, shapes)) for of in samples]
+        make: Any = _Entries
+        return [tuple(map(make, of, places, shapes)) for of in samples]
 
     def _columns(self, reach: float = 1.0) -> list[np.ndarray]:
         """The inputs at these states, one array (states,) for each: of order one, but q of this order."""

@@ -79,7 +79,7 @@ class Motion(eqx.Module):
     def unbalanced_force(self, q: Vector, qdot: Vector, qddot: Vector, t: Time, params: PyTree) -> Vector:
         """M q̈ − F, as dp/dt − ∂L/∂q − Q: the forces that an acceleration takes beside those of the scene."""
         along = qdot, qddot, jnp.ones_like(t)
-        _, rate = jax.jvp(lambda *state: self.momentum(*state, params), (q, qdot, t), along)
+        _, rate = jax.jvp(lambda q, qdot, t: self.momentum(q, qdot, t, params), (q, qdot, t), along)
         return rate - self.generalized_force(q, qdot, t, params)
 
     def energy(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Scalar:
@@ -117,7 +117,7 @@ class Motion(eqx.Module):
         return pull(self.multipliers(q, qdot, t, params))
 
     def required_force(
-        self, q: Vector, qdot: Vector, t: Time, params: PyTree, qddot: Vector, terms=0.0
+        self, q: Vector, qdot: Vector, t: Time, params: PyTree, qddot: Vector, terms: Any = 0.0
     ) -> tuple[Vector, Bool[Array, " m"]]:
         """τ of M q̈ = F + τ + Gᵀλ, the shortest in the metric of M⁻¹, and which constraints q̈ violates.
 

@@ -15,7 +15,7 @@ import abc
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -271,7 +271,7 @@ def refine(product: Callable, solve: Callable, right):
     return jax.lax.fori_loop(0, 2, once_more, (jax.tree.map(jnp.zeros_like, right), right))[0]
 
 
-def form_of(pattern: "scipy.sparse.csr_array | None", size: int) -> MatrixForm:
+def form_of(pattern: Any, size: int) -> MatrixForm:
     """The form that suits the pattern of a symmetric matrix; None is an unknown one."""
     if pattern is None:
         return MatrixFree(size)

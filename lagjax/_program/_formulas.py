@@ -82,7 +82,7 @@ class Formulas:
         if op == "constant":
             return {ONE: attribute} if attribute else {}
         if op == "input":
-            return {((self._atom("input", attribute), 1),): 1.0}
+            return raised(self._atom("input", attribute))
         if op in ("add", "sub"):
             return add(xs[0], xs[1], 1.0 if op == "add" else -1.0)
         if op == "neg":
@@ -131,12 +131,12 @@ class Formulas:
 
     def _raise(self, x: Sum, power: float) -> Sum:
         if len(x) != 1:
-            return self._factor(x, power) if x else {((self._atom("sum", -1, ((),)), power),): 1.0}
+            return self._factor(x, power) if x else raised(self._atom("sum", -1, ((),)), power)
         ((product, c),) = x.items()
         plain = len(product) == 1 and product[0][1] == 1 and c == 1
         if power == int(power) or plain or (not product and c > 0):
             return {tuple((atom, power * p) for atom, p in product): c**power}
-        return {((self._atom("sum", -1, (freeze(x),)), power),): 1.0}
+        return raised(self._atom("sum", -1, (freeze(x),)), power)
 
     # ---- the shortest form ----
 
@@ -190,8 +190,8 @@ class Formulas:
         """The sum with two of its products in one: `product`, and that with the other functions of both angles."""
         turns = [a for a, p in product for _ in range(min(2, int(p)) if p > 0 else 0) if self._is_turn(a)]
         for a, b in itertools.combinations(turns, 2):
-            rest = multiply({product: 1.0}, multiply({((a, -1),): 1.0}, {((b, -1),): 1.0}))
-            others = multiply(*({((self._other(of), 1),): 1.0} for of in (a, b)))
+            rest = multiply({product: 1.0}, multiply(raised(a, -1), raised(b, -1)))
+            others = multiply(*(raised(self._other(of)) for of in (a, b)))
             (partner,) = multiply(rest, others)
             if partner == product or abs(x[product]) != abs(x.get(partner, 0.0)):
                 continue
@@ -226,7 +226,7 @@ class Formulas:
         for atom in sorted(self._written, key=lambda a: -len(self.atoms[a].operands[0])):
             terms = dict(self.atoms[atom].operands[0])
             while (found := _multiple(x, terms)) is not None:
-                shorter = self._replace(x, multiply(found, terms), multiply(found, {((atom, 1),): 1.0}))
+                shorter = self._replace(x, multiply(found, terms), multiply(found, raised(atom)))
                 if shorter is None or x.keys() == terms.keys():
                     break
                 x = shorter
@@ -250,6 +250,11 @@ class Formulas:
 
     def _is_parameter(self, atom: int) -> bool:
         return self.atoms[atom].kind == "input" and self.atoms[atom].position >= self.moving
+
+
+def raised(atom: int, power: float = 1) -> Sum:
+    """A power of an atom."""
+    return {((atom, power),): 1.0}
 
 
 def freeze(x: Sum) -> tuple:

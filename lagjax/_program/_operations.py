@@ -224,7 +224,7 @@ def _bitwise(
     )  # fmt: skip
 
 
-def _step(name: str, value: Callable, llvm: Callable, simplify: Callable | None = None, **texts: str) -> Operation:
+def _step(name: str, value: Callable, llvm: Callable, simplify: Callable | None = None, **texts: Any) -> Operation:
     return Operation(name, 1, value, llvm, simplify=simplify, is_step=True, exact=True, side=_result, **texts)
 
 

@@ -36,7 +36,7 @@ _ELSEWHERE = {  # words of SciPy and diffrax
     "t_eval": _TIMES,
     "t_span": _TIMES,
     "saveat": _TIMES,
-    "dense_output": f"{_TIMES}; outputs between steps are as accurate as steps",
+    "dense_output": f"{_TIMES}; trajectory.at(t) gives states between these",
     "args": "what the functions of a scene take besides the state is params",
     "y0": "the state is q0, qdot0",
     "events": "event=f, or a dict of functions, ends the motion; lagjax.crossings finds all instants",

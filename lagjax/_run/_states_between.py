@@ -1,6 +1,6 @@
 """`find_states`: a motion between its outputs, each state by a run of the engine from the output before it.
 
-    (trajectory, t) ─► Places ─► one batch, a lane for each time ─► State
+    (trajectory, t) ─► LanePlaces ─► one batch, a lane for each time ─► State
 
 A lane runs from the time of an output, and the state there, to t. A time that is an output has the numbers of that
 output. Where times are being traced it is not known which of them are outputs: all have a lane, which at an output
@@ -37,8 +37,9 @@ PyTree = Any
 def find_states(run: Trajectory, t) -> State:
     """The states at times t, whose axes come behind those of the batch (see `Trajectory.at`)."""
     settings, batch = _require_settings(run), jnp.shape(run.result._value)
+    run._require_present()
     times, shape = _spread_times(run, t, batch)
-    places = Places.from_trajectory(run, times, batch)
+    places = LanePlaces.from_trajectory(run, times, batch)
     library: Any = np if all(map(is_concrete, jax.tree.leaves((run, times)))) else jnp
     own = lambda x: library.asarray(x).reshape(-1, *jnp.shape(x)[len(batch) :])  # noqa: E731
     flat = jax.tree.map(own, (run.q, run.qdot, run.mode))
@@ -47,7 +48,7 @@ def find_states(run: Trajectory, t) -> State:
     return State(*(jax.device_put(states) if library is np else states))
 
 
-def _states_at_places(run: Trajectory, settings: "RunSettings", places: "Places", flat: tuple) -> PyTree:
+def _states_at_places(run: Trajectory, settings: "RunSettings", places: "LanePlaces", flat: tuple) -> PyTree:
     """q and q̇, (N, K, …), of N members at K times each; `flat` are q, q̇ and the mode at their T outputs, (N, T, …)."""
     (count, each), rows = places.times.shape, np.arange(len(places.times))[:, None]
     stored = jax.tree.map(lambda x: x[rows, places.output], flat[:2])
@@ -85,7 +86,7 @@ def _exchange_value_jvp(primals, tangents):
     return _exchange_value(*primals), tangents[0]
 
 
-class Places(NamedTuple):
+class LanePlaces(NamedTuple):
     """The places of K times in each of N motions, with T outputs each.
 
     - `times`: the times, (N, K); `live`: where the motion has been then.
@@ -106,7 +107,7 @@ class Places(NamedTuple):
         return isinstance(self.is_output, np.ndarray)
 
     @classmethod
-    def from_trajectory(cls, run: Trajectory, times, batch: tuple[int, ...]) -> "Places":
+    def from_trajectory(cls, run: Trajectory, times, batch: tuple[int, ...]) -> "LanePlaces":
         """The places of times (N, K); raises `ValueError` where one lies outside of the motion."""
         ts = _spread_rows(run.ts, batch, 1)
         xp: Any = np if all(map(is_concrete, (times, ts))) else jnp
@@ -152,14 +153,15 @@ def _follow_lanes(run: Trajectory, settings: "RunSettings", ts, member: np.ndarr
     """
     (q, qdot, mode), (params, axes) = state, spread_params(run, member)
     tolerances = settings.tolerances or run.tolerances
-    if any(jnp.ndim(x) for x in tolerances or ()):
+    if any(x is not None and jnp.ndim(x) for x in tolerances or ()):
         raise ValueError("Its members have tolerances of their own: ask each of them for states between its outputs.")
     rtol, atol = tolerances or (None, None)
+    engine: Any = settings.engine
     if isinstance(run.system, dict):
         modes = {name: run.system[name] for name in run.mode_names}
 
         def follow(q, qdot, ts, start, params):
-            scene = Hybrid(modes, list(settings.transitions), start, settings.max_transitions)
+            scene = Hybrid(modes, list(settings.transitions), start, settings.max_transitions or 0)
             return follow_modes(scene, q, qdot, ts, params, rtol, atol, settings.max_steps, False)
 
         done = jax.vmap(follow, (0, 0, 0, 0, axes))(q, qdot, jnp.asarray(ts), mode, params)
@@ -173,7 +175,7 @@ def _follow_lanes(run: Trajectory, settings: "RunSettings", ts, member: np.ndarr
             done = follow_contacts_batch(given, batch, settings.max_transitions, params, axes)
             result, q, qdot = done.result._value, done.q, done.qdot
         else:
-            done = settings.engine.solve_batch(batch)
+            done = engine.solve_batch(batch)
             result, (q, qdot) = done.result, map(batch.member.layout.restore, halves(done.path))
     if is_concrete(result) and not np.isin(result, ENDED_WELL).all():
         lane = int(np.flatnonzero(~np.isin(result, ENDED_WELL))[0])
@@ -201,7 +203,7 @@ def _spread_times(run: Trajectory, t, batch: tuple[int, ...]) -> tuple[Any, tupl
     except ValueError:
         raise ValueError(
             f"t has shape {t.shape}, and the batch {batch}: give a number or times (K,) for all members, or for each "
-            f"its own, which broadcast with {(*batch, 'K')}: (…, 1) for one time each."
+            f"its own, which broadcast with ({', '.join(map(str, batch))}, K): K = 1 for one time each."
         ) from None
     return times.reshape(-1, t.shape[-1]), shape
 
@@ -220,7 +222,7 @@ def _spread_rows(x, batch: tuple[int, ...], dimensions: int):
 
 
 def _require_settings(run: Trajectory) -> RunSettings:
-    """How a trajectory was integrated. Raises `ValueError` where it does not say so, or has no scene."""
+    """The settings of a trajectory. Raises `ValueError` where it has none, or no scene."""
     if run.system is None or run.settings is None:
         raise ValueError(
             "This trajectory does not say how it was integrated, or of which system it is: states between its outputs "

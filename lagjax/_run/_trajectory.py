@@ -175,7 +175,7 @@ class ContactChanges(NamedTuple):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True, eq=False)
 class RunSettings:
-    """How a motion was integrated: what another run of its scene needs. Equal to one with equal values.
+    """The engine of a motion and its options, which another run of its scene needs. Equal to one with equal values.
 
     - `engine`: what integrated it; None where numbers of its solver were being traced.
     - `tolerances`: rtol and atol as they were given; None where they were being traced.
@@ -191,9 +191,10 @@ class RunSettings:
     @classmethod
     def from_problem(cls, problem: Problem, engine: AbstractEngine, **more: Any) -> "RunSettings":
         known = all(map(is_concrete, jax.tree.leaves(engine)))
-        numbers = problem.tolerances if all(map(is_concrete, problem.tolerances)) else None
-        tolerances = numbers and tuple(None if x is None else float(x) for x in numbers)
-        return cls(engine if known else None, tolerances, problem.max_steps, **more)
+        rtol, atol = problem.tolerances
+        of_numbers = lambda x: None if x is None else float(x)  # noqa: E731
+        given = (of_numbers(rtol), of_numbers(atol)) if is_concrete(rtol) and is_concrete(atol) else None
+        return cls(engine if known else None, given, problem.max_steps, **more)
 
     @functools.cached_property
     def _key(self) -> tuple:
@@ -211,7 +212,7 @@ class RunSettings:
 class Trajectory(eqx.Module):
     """The motion of a system at the times `ts`, one trajectory or a batch of them.
 
-    - `ts`: the output times, shape (T,).
+    - `ts`: the output times, shape (T,), or (batch, T) where members have times of their own.
     - `q`, `qdot`: the structure of the initial state, with the time axis in front of every leaf, and the batch axis,
       if there is one, in front of that. NaN at times that were not reached.
     - `result`: how each member ended, one of `lagjax.RESULTS`; `ok`: whether it ended well, at the last time or at an
@@ -266,7 +267,7 @@ class Trajectory(eqx.Module):
         def __getattr__(self, name: str):
             text = f"A Trajectory has no attribute {name!r}."
             if name in ("t", "y", "ys", "sol"):
-                text += " Its times are `ts`, its states `q` and `qdot`; for states at more times give them in ts."
+                text += " Its times are `ts`, its states `q` and `qdot`; `at(t)` gives states at other times."
             raise AttributeError(text)
 
     def __repr__(self) -> str:
@@ -314,7 +315,6 @@ class Trajectory(eqx.Module):
         assert abs(run.at(2.5).q - jnp.cos(2.5)) < 1e-6
         ```
         """
-        self._require_present()
         return registered().find_states(self, t)
 
     def energy(self) -> jax.Array:

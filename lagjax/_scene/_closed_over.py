@@ -71,7 +71,7 @@ def lift_problem(problem: Problem) -> Problem:
     fields = object.__getattribute__(problem.system, "__dict__")  # an attribute of an equinox.Module takes 2 µs
     present = [f for role in ROLES if isinstance(f := fields[role], Function)]
     if problem.event is not None:
-        present += filter(_is_function, problem.event.functions)
+        present += [f for f in problem.event.functions if isinstance(f, Function)]
     if not any(object.__getattribute__(f, "code").tracers for f in present):
         return problem
     if jax.tree.leaves((problem.system, present)):  # what holds arrays of its own has no program anyway

@@ -80,18 +80,19 @@ def write_equations(system: "System", layout: Layout, params: PyTree, inputs: Py
         system, params = drive_scene(system, held_inputs), Driven(params, inputs)
     quantities = ("mass_matrix", "force", "residual", "jacobian", "gamma")
     try:
-        derivation = derivation_of(system, layout, params).lowered
-        line = derivation.program(*quantities).line
+        derivation = derivation_of(system, layout, params)
+        line = None if derivation.form.is_sparse else derivation.program(*quantities).line
     except Unlowerable as reason:
         return Equations(note=f"This scene has no formulas to read: {reason}.")
-    if line.operations > MOST_READ:
+    if line is None or line.operations > MOST_READ:
+        count = derivation.form.operations if line is None else line.operations
         return Equations(
-            note=f"The equations of this scene take {line.operations} operations, more than the {MOST_READ} that are "
+            note=f"The equations of this scene take {count} operations, more than the {MOST_READ} that are "
             "read with profit. system.to_c(q, qdot, params=params) writes all of them in C; system.explain tells what "
             "they contain."
         )
     found = Formulas(line, 2 * layout.size + 1)
-    sums = dict(zip(quantities, _split(derivation, found, quantities), strict=True))
+    sums: dict[str, Any] = dict(zip(quantities, _split(derivation, found, quantities), strict=True))
     return _Page(found, sums, input_names(layout.names, numbers), names).equations()
 
 

@@ -4,6 +4,7 @@ A product is written as numbers, parameters, coordinates, functions, velocities;
 What has a negative power is written below the line of a fraction.
 """
 
+import keyword
 import re
 import unicodedata
 from collections import Counter
@@ -151,7 +152,7 @@ class FormulaWriter:
         if of.kind == "sum":
             first = min((place[1:3] for place in inner if place[0] == largest), default=(9, ""))
             return largest, first[0] if largest == _PARAMETER else 2, first[1]
-        return max(largest, _FUNCTION), 0, of.kind, atom
+        return max(largest, _FUNCTION), of.kind != "sin", of.kind, atom
 
     def _order(self, product: Product) -> tuple:
         """The place of a term in a sum, by its factors: those with velocities stand behind others, constants last."""
@@ -215,7 +216,7 @@ def input_names(coordinates: Sequence[str], numbers: Sequence[str]) -> list[Name
 
 def short_names(labels: Sequence[str]) -> list[str]:
     """Identifiers for labels such as q['theta1'], by their keys where these say which is meant."""
-    short = list(map(_identifier, labels))
+    short = [x + "_" * (keyword.iskeyword(x) or x in OPERATIONS) for x in map(_identifier, labels)]
     often = Counter(short)
     return [x if often[x] == 1 else "_".join(re.findall(r"\w+", of)) for x, of in zip(short, labels, strict=True)]
 
@@ -237,6 +238,7 @@ _LETTERS = (
 
 def latex_name(name: str, dot: bool = False) -> str:
     r"""theta1 is \theta_{1}, m_cart is m_{\mathrm{cart}}."""
+    name = name.rstrip("_")
     base, below = re.fullmatch(r"(.+?)_?(\d*|(?<=_)\w+)", name).groups()  # type: ignore[union-attr]
     if "_" in name.strip("_"):
         base, below = name.strip("_").split("_", 1)

@@ -17,6 +17,8 @@ START = np.array([1.0, 0.2]), np.array([0.0, 1.1])
 CENTRAL = lagjax.System(lambda q, v: 0.5 * (v["r"] ** 2 + (q["r"] * v["phi"]) ** 2) + 1 / q["r"])
 CIRCLE = lagjax.System(free_particles, constraints=lambda q: q @ q - 4.0)
 ROD = lagjax.System(free_particles, constraints=lambda q: q @ q - 1)
+TWO_DRAGS = lagjax.System(free_particles, forces=lambda q, v: -v, dissipation=lambda q, v: 0.1 * v @ v)
+DRAG = lagjax.System(free_particles, forces=lambda q, v: -v)
 
 
 def polar(p):
@@ -57,11 +59,10 @@ def test_one_motion_in_polar_and_in_turning_coordinates():
 
 @pytest.mark.slow
 def test_forces_and_constraints_come_along():
-    drag = lagjax.System(free_particles, forces=lambda q, v: -v, dissipation=lambda q, v: 0.1 * v @ v)
-    changed = lagjax.change_coordinates(drag, polar)
+    changed = lagjax.change_coordinates(TWO_DRAGS, polar)
     state = {"r": 2.0, "phi": 0.3}, {"r": 0.5, "phi": 0.7}
     q, qdot = changed.old_from_new(*state)
-    power = drag.generalized_force(q, qdot) @ qdot
+    power = TWO_DRAGS.generalized_force(q, qdot) @ qdot
     force = changed.system.generalized_force(*state)
     kinetic = {"r": 2.0 * 0.7**2, "phi": 0.0}  # ∂L/∂Q
     np.testing.assert_allclose(sum((force[k] - kinetic[k]) * state[1][k] for k in force), power, rtol=1e-13)
@@ -136,8 +137,7 @@ def test_what_cannot_be_reduced_is_said():
         lagjax.routhian(KEPLER, *START)
     with pytest.raises(ValueError, match="every coordinate is cyclic"):
         lagjax.routhian(FREE, 0.0, 1.0)
-    drag = lagjax.System(free_particles, forces=lambda q, v: -v)
     with pytest.raises(ValueError, match="without constraints, forces"):
-        lagjax.routhian(drag, *START)
+        lagjax.routhian(DRAG, *START)
     with pytest.raises(ValueError, match="without constraints"):
         lagjax.hamiltonian(ROD)

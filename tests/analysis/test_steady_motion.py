@@ -65,6 +65,14 @@ CAR = lagjax.System(
     forces=lambda q, v, params: {"x": params - 0.5 * v["x"], "w": 0.0 * v["w"]},
 )
 
+# A cylinder of radius ½ that a force rolls without slip, x − ½ w = 0, and a row of rotors.
+ROLLER = lagjax.System(
+    lambda q, v: 0.5 * v["x"] ** 2 + 0.25 * v["w"] ** 2,
+    constraints=lambda q: q["x"] - 0.5 * q["w"],
+    forces=lambda q, v, params: {"x": params - 0.2 * v["x"], "w": 0.0 * v["w"]},
+)
+ROTORS = lagjax.System(lambda q, v: 0.5 * v @ v - jnp.sum(1 - jnp.cos(q[1:] - q[:-1])))
+
 
 def exponents(system, motion, params=None):
     return np.linalg.eigvals(lagjax.linearize(system, motion.q, motion.qdot, params).reduced(motion).A)
@@ -143,6 +151,18 @@ def test_a_sleigh_is_stable_with_its_weight_ahead():
 def test_a_driven_car_settles_at_its_speed():
     motion = lagjax.steady_motion(CAR, {"w": 0.1, "x": 0.3}, {"w": 0.0, "x": 1.0}, 2.0)
     np.testing.assert_allclose([motion.qdot["x"], motion.q["w"], motion.q["x"]], [4.0, -4.0, 0.3], rtol=1e-12)
+
+
+def test_coordinates_may_move_together():
+    motion = lagjax.steady_motion(ROLLER, {"w": 0.0, "x": 0.0}, {"w": 7.0, "x": 3.0}, 1.0)
+    np.testing.assert_allclose([motion.qdot["x"], motion.qdot["w"]], [5.0, 10.0], rtol=1e-12)
+    np.testing.assert_allclose(exponents(ROLLER, motion, 1.0), [-0.2 / 3], rtol=1e-12)
+    motion = lagjax.steady_motion(ROTORS, np.zeros(6), np.full(6, 2.0), hold="qdot[4]")
+    np.testing.assert_allclose(motion.qdot, np.full(6, 2.0), rtol=1e-12)
+    assert motion.cyclic.tolist() == [False] * 4 + [True, False]
+    found = np.sort(np.abs(exponents(ROTORS, motion)))
+    expected = np.append(0.0, np.repeat(2 * np.sin(np.pi * np.arange(1, 6) / 12), 2))
+    np.testing.assert_allclose(found, expected, atol=1e-10)
 
 
 @pytest.mark.slow

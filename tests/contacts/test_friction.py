@@ -98,6 +98,10 @@ PUSHED = lagjax.System(
     friction=lambda params: params[0],
     forces=lambda q, v, params: params[1] * jnp.array([jnp.cos(params[2]), jnp.sin(params[2]), 0.0]),
 )  # fmt: skip
+BLOCK_ON_A_SLOPE = lagjax.System(
+    lambda q, v, params: 0.5 * v @ v - G * (jnp.cos(params) * q[1] + jnp.sin(params) * q[0]),
+    contacts=lambda q: q[1], slip=lambda q, v: v[0], friction=0.3,
+)  # fmt: skip
 PUSH = jnp.array([0.3, 5.0, 0.7])
 
 
@@ -162,14 +166,10 @@ def test_a_straight_slip_in_space_has_its_derivatives_across_in_both_modes():
 @pytest.mark.slow
 def test_a_start_at_rest_that_slides_at_once_has_no_derivative_by_its_slip():
     """Friction turns with the least slip: the ends of starts uphill and downhill differ in their slopes."""
-    block = lagjax.System(
-        lambda q, v, params: 0.5 * v @ v - G * (jnp.cos(params) * q[1] + jnp.sin(params) * q[0]),
-        contacts=lambda q: q[1], slip=lambda q, v: v[0], friction=0.3,
-    )  # fmt: skip
     rest = np.zeros(2)
 
     def run(v, tilt):
-        return lagjax.simulate(block, rest, v, jnp.array([0.0, 2.0]), tilt)
+        return lagjax.simulate(BLOCK_ON_A_SLOPE, rest, v, jnp.array([0.0, 2.0]), tilt)
 
     by_start, by_tilt = jax.jacfwd(lambda *x: run(*x).q[-1, 0], argnums=(0, 1))(rest, 0.5)
     assert np.isnan(by_start[0]) and by_start[1] == 0.0

@@ -121,6 +121,16 @@ EDGES = {
         q["y"] - jnp.interp(q["x"], jnp.array([-9.0, 0.0, 0.1, 9.0]), jnp.array([0.0, 0.0, -50.0, -60.0]))
     ),
 }
+RISING_FLOOR = lagjax.System(
+    lambda q, v: 0.5 * v**2 - G * q, contacts=lambda q, t: q - 2.0 * jnp.maximum(t - 1.0, 0.0), restitution=1.0
+)
+BELT_THAT_ENDS = lagjax.System(
+    planar, contacts=lambda q: q["y"], friction=0.2,
+    slip=lambda q, v, t: v["x"] - jnp.where(t > 1.0, 3.0, 0.0),
+)  # fmt: skip
+STEP_BEFORE_A_WALL = lagjax.System(
+    lambda q, v: 0.5 * v**2 - jnp.where(q > 0, 0.1, 0.0), contacts=lambda q: 1 - q, restitution=1.0
+)
 
 
 @pytest.mark.parametrize("name", sweep(EDGES, kept=["steep"]))
@@ -135,20 +145,13 @@ def test_a_block_slides_off_the_edge_of_a_table(name):
 
 def test_a_step_in_time_strikes_what_rests_on_it():
     """A piston that sets out at t = 1 with speed 2; outputs at that very time are there."""
-    system = lagjax.System(
-        lambda q, v: 0.5 * v**2 - G * q, contacts=lambda q, t: q - 2.0 * jnp.maximum(t - 1.0, 0.0), restitution=1.0
-    )
-    run = lagjax.simulate(system, 0.0, 0.0, np.array([0.0, 1.0, 1.2]))
+    run = lagjax.simulate(RISING_FLOOR, 0.0, 0.0, np.array([0.0, 1.0, 1.2]))
     np.testing.assert_allclose(run.q, [0.0, 0.0, 4 * 0.2 - G * 0.2**2 / 2], rtol=0, atol=1e-12)
 
 
 def test_a_belt_that_ends_lets_slip_what_sticks_to_it():
     """From the belt, which is at rest, a block that a force pulls comes onto one that runs."""
-    system = lagjax.System(
-        planar, contacts=lambda q: q["y"], friction=0.2,
-        slip=lambda q, v, t: v["x"] - jnp.where(t > 1.0, 3.0, 0.0),
-    )  # fmt: skip
-    run = lagjax.simulate(system, {"x": 0.0, "y": 0.0}, {"x": 0.0, "y": 0.0}, np.array([0.0, 1.0, 2.0]))
+    run = lagjax.simulate(BELT_THAT_ENDS, {"x": 0.0, "y": 0.0}, {"x": 0.0, "y": 0.0}, np.array([0.0, 1.0, 2.0]))
     np.testing.assert_allclose(run.qdot["x"], [0.0, 0.0, 0.2 * G], rtol=0, atol=1e-11)
 
 
@@ -179,10 +182,7 @@ def test_a_gap_that_is_zero_at_its_corner_is_refused(gap):
 
 def test_a_potential_step_beside_a_contact():
     """L jumps by 0.1 at x = 0: ½ v² falls by that. Before, an open gap made the motion NaN."""
-    system = lagjax.System(
-        lambda q, v: 0.5 * v**2 - jnp.where(q > 0, 0.1, 0.0), contacts=lambda q: 1 - q, restitution=1.0
-    )
-    run = lagjax.simulate(system, -0.5, 1.0, np.array([0.0, 1.0, 3.0]))
+    run = lagjax.simulate(STEP_BEFORE_A_WALL, -0.5, 1.0, np.array([0.0, 1.0, 3.0]))
     slow = np.sqrt(0.8)
     np.testing.assert_allclose(run.q[1], 0.5 * slow, rtol=0, atol=1e-13)
     np.testing.assert_allclose(run.qdot[2], -1.0, rtol=0, atol=1e-13)

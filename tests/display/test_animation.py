@@ -11,6 +11,7 @@ import lagjax
 from lagjax._show import _animation, course_of
 
 SPRING = lagjax.System(lambda q, v, params: 0.5 * v["x"] ** 2 - 0.5 * params * q["x"] ** 2)
+SPRING_OF_A_LIST = lagjax.System(lambda q, v, params: 0.5 * v["x"] ** 2 - 0.5 * params["k"][0] * q["x"] ** 2)
 TS = np.linspace(0.0, 6.0, 31)
 
 
@@ -117,8 +118,7 @@ def test_beyond_the_outputs_nothing_is_known(run):
 
 def test_points_in_a_list_and_by_a_whole_number():
     params = {"k": np.array([1.0, 2.0]), "which": np.array(1)}
-    scene = lagjax.System(lambda q, v, params: 0.5 * v["x"] ** 2 - 0.5 * params["k"][0] * q["x"] ** 2)
-    run = lagjax.simulate(scene, {"x": 1.0}, {"x": 0.0}, TS, params)
+    run = lagjax.simulate(SPRING_OF_A_LIST, {"x": 1.0}, {"x": 0.0}, TS, params)
     film = run.animate(lambda q, params: [[0.0, 0.0], [q["x"], params["k"][params["which"]]]])
     (positions,) = film.positions(np.array([0.0, 6.0])).values()
     np.testing.assert_allclose(positions[0, :, 1], [[1.0, 2.0], [np.cos(6.0), 2.0]], atol=1e-8)

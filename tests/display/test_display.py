@@ -20,6 +20,8 @@ def falling(q, qdot):
 
 FALL = lagjax.System(falling)
 COUNTED = lagjax.System(lambda q, v, params: 0.5 * v**2 - sum(q**2 for _ in range(params["n"])))
+POINT_AND_PLANE = lagjax.System(lambda q, v: 0.5 * v["x"] ** 2 + 0.5 * v["y"] @ v["y"] - 0.5 * q["x"] ** 2)
+HELD_FALL = lagjax.System(falling, constraints=lambda q: q, path="array")
 TS = np.linspace(0.0, 2.0, 5)
 
 
@@ -34,9 +36,8 @@ def fallen():
 
 
 def test_one_motion():
-    scene = lagjax.System(lambda q, v: 0.5 * v["x"] ** 2 + 0.5 * v["y"] @ v["y"] - 0.5 * q["x"] ** 2)
     q0 = {"x": 1.0, "y": np.zeros(2)}
-    run = lagjax.simulate(scene, q0, jax.tree.map(jnp.zeros_like, q0), TS)
+    run = lagjax.simulate(POINT_AND_PLANE, q0, jax.tree.map(jnp.zeros_like, q0), TS)
     steps = int(run.stats["num_steps"])
     assert lines(run) == [
         "Trajectory, float64: q['x'] (5,), q['y'] (5, 2), and qdot",
@@ -100,8 +101,7 @@ def test_batches_of_batches_and_times_of_their_own():
 
 def test_a_scene_is_one_line():
     assert repr(FALL) == "System(lagrangian=falling, path='auto')"
-    scene = lagjax.System(falling, constraints=lambda q: q, path="array")
-    assert repr(scene) == "System(lagrangian=falling, constraints=<lambda>, path='array')"
+    assert repr(HELD_FALL) == "System(lagrangian=falling, constraints=<lambda>, path='array')"
 
 
 def test_a_notebook_shows_the_lines_and_a_picture(fallen):

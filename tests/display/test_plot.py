@@ -75,6 +75,7 @@ def test_path(single):
 SPEEDS, FALL = np.linspace(0.1, 1.3, 20), np.linspace(0.0, 2.2, 12)
 CHAIN = lagjax.System(lambda q, qdot: 0.5 * qdot @ qdot - 0.5 * jnp.sum(jnp.diff(q) ** 2))
 SADDLE = lagjax.System(lambda q, v: 0.5 * v @ v + 0.5 * q[0] ** 2 - 2 * q[1] ** 2)
+COUPLED_PAIR = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q - 0.5 * (q[0] - q[1]) ** 2)
 
 
 @pytest.fixture(scope="module")
@@ -262,8 +263,7 @@ def test_motions_and_data_are_compared(single, batch):
 
 
 def test_shapes_of_modes():
-    scene = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q - 0.5 * (q[0] - q[1]) ** 2)
-    modes = lagjax.normal_modes(scene, np.zeros(2))  # 1, in step, and √3, against each other
+    modes = lagjax.normal_modes(COUPLED_PAIR, np.zeros(2))  # 1, in step, and √3, against each other
     axes = lagjax.plot.modes(modes)
     assert [ax.get_title() for ax in axes] == ["ω = 1", "ω = 1.732"]
     heights = [[bar.get_height() for bar in ax.patches] for ax in axes]
@@ -310,25 +310,35 @@ def test_modes_tell_what_grows_and_are_drawn_at_their_largest():
     assert lagjax.plot.modes(lagjax.normal_modes(rubbing, 0.0))[0].get_title() == "ω = 0.995, ζ = 0.1"
 
 
-def test_a_bifurcation_diagram_of_a_driven_spring():
-    def lagrangian(q, v, params, t):
-        return 0.5 * v**2 - 0.5 * q**2 + params["A"] * q * jnp.cos(params["w"] * t)
+def _driven_spring(q, v, params, t):
+    return 0.5 * v**2 - 0.5 * q**2 + params["A"] * q * jnp.cos(params["w"] * t)
 
-    spring = lagjax.System(lagrangian, dissipation=lambda q, v: 0.25 * v**2)
+
+DRIVEN = lagjax.System(_driven_spring, dissipation=lambda q, v: 0.25 * v**2)
+LIFTED = lagjax.System(
+    lambda q, v: 0.5 * v @ v - q[0] - q[1],
+    forces=lambda q, v, t: jnp.stack([t, 0.0 * t]),
+    contacts=lambda q: {"floor": q[0], "lid": 5.0 - q[0], "step": q[1]},
+)
+STIFF = lagjax.System(lambda q, v: 0.5 * v**2 - 2 * q**2)
+ROW = lagjax.System(lambda q, v: 0.5 * jnp.sum(v["u"] ** 2) + 0.5 * v["x"] ** 2)
+
+
+def test_a_bifurcation_diagram_of_a_driven_spring():
     drives, rates = np.linspace(0.0, 2.0, 5), np.linspace(0.5, 2.0, 4)
 
     def seen(A, w):  # of A cos wt, once in a period
         return A * (1 - w**2) / ((1 - w**2) ** 2 + (0.5 * w) ** 2)
 
     start = dict(q0=1.0, params={"A": 0.0, "w": 2.0}, transient=20, points=3)
-    ax = lagjax.plot.bifurcation(spring, {"A": drives}, np.pi, **start)
+    ax = lagjax.plot.bifurcation(DRIVEN, {"A": drives}, np.pi, **start)
     x, y = ax.collections[0].get_offsets().T
     np.testing.assert_array_equal(x, np.repeat(drives, 3))
     np.testing.assert_allclose(y, seen(x, 2.0), atol=2e-7)  # exp(-0.25 * 21π) of the start is left
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("A", "q")
     start["params"] = lambda point: {"A": 2.0, "w": point["w"]}
     ax = lagjax.plot.bifurcation(
-        spring,
+        DRIVEN,
         {"w": rates},
         lambda point: 2 * jnp.pi / point["w"],
         **start,
@@ -382,12 +392,7 @@ def test_angles_leave_at_one_edge_and_come_in_at_the_other(rotor):
 
 
 def test_modes_and_closed_contacts_are_shaded():
-    lifted = lagjax.System(
-        lambda q, v: 0.5 * v @ v - q[0] - q[1],
-        forces=lambda q, v, t: jnp.stack([t, 0.0 * t]),
-        contacts=lambda q: {"floor": q[0], "lid": 5.0 - q[0], "step": q[1]},
-    )
-    run = lagjax.simulate(lifted, np.array([0.0, 0.5]), np.zeros(2), np.linspace(0.0, 2.0, 11))
+    run = lagjax.simulate(LIFTED, np.array([0.0, 0.5]), np.zeros(2), np.linspace(0.0, 2.0, 11))
     ax = lagjax.plot.trajectory(run)  # the force is as large as the weight at t = 1, when the other has fallen by 1/2
     spans = {span.get_label(): span.get_bbox().extents for span in ax.patches}
     assert list(spans) == ["contacts['floor']", "contacts['step']"]
@@ -398,7 +403,7 @@ def test_modes_and_closed_contacts_are_shaded():
 
 
 def test_modes_are_shaded():
-    modes = {"slow": OSCILLATOR, "fast": lagjax.System(lambda q, v: 0.5 * v**2 - 2 * q**2)}
+    modes = {"slow": OSCILLATOR, "fast": STIFF}
     there, back = (lagjax.Transition(*names, lambda q, v: q, 0) for names in (("slow", "fast"), ("fast", "slow")))
     run = lagjax.simulate(lagjax.Hybrid(modes, [there, back], "slow"), 1.0, 0.0, np.linspace(0.0, 4.0, 9))
     ax = lagjax.plot.trajectory(run)
@@ -411,9 +416,8 @@ def test_modes_are_shaded():
 
 
 def test_rows_of_a_lattice(rotor):
-    chain = lagjax.System(lambda q, v: 0.5 * jnp.sum(v["u"] ** 2) + 0.5 * v["x"] ** 2)
     start = {"u": np.zeros(9), "x": 0.0}, {"u": np.arange(9.0), "x": 1.0}
-    run = lagjax.simulate(chain, *start, TS)
+    run = lagjax.simulate(ROW, *start, TS)
     ax = lagjax.plot.space_time(run, "qdot['u']")
     np.testing.assert_array_equal(ax.collections[0].get_array().reshape(9, len(TS)), run.qdot["u"].T)
     ax = lagjax.plot.space_time(run, "q['u']", period=2 * np.pi)

@@ -50,6 +50,10 @@ def rod(q):
 
 
 WEIGHT_ON_A_ROD = lagjax.System(weight, constraints=rod)
+HELD_WITHOUT_MASS = lagjax.System(
+    lambda q, v: 0.5 * v[0] ** 2 - 0.5 * q[1] ** 2, constraints=lambda q: q[1] - q[0] ** 2
+)
+QUARTIC = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**4)
 
 
 def hung(angle, rate=0.0):
@@ -270,16 +274,14 @@ def test_a_pendulum_on_a_shaken_support(path):
 @pytest.mark.slow
 def test_a_coordinate_without_mass_that_a_constraint_holds():
     # The spring acts on z, which has no kinetic energy; z = x² ties it to the mass: ½ ẋ² − ½ (x²)².
-    system = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - 0.5 * q[1] ** 2, constraints=lambda q: q[1] - q[0] ** 2)
-    minimal = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**4)
     ts = np.linspace(0, 3, 3)
-    free = lagjax.simulate(minimal, 1.1, 0.3, ts, rtol=1e-12)
-    run = lagjax.simulate(system, np.array([1.1, 1.21]), np.array([0.3, 0.66]), ts, rtol=1e-12)
+    free = lagjax.simulate(QUARTIC, 1.1, 0.3, ts, rtol=1e-12)
+    run = lagjax.simulate(HELD_WITHOUT_MASS, np.array([1.1, 1.21]), np.array([0.3, 0.66]), ts, rtol=1e-12)
     np.testing.assert_allclose(run.q[:, 0], free.q, atol=1e-10)
     np.testing.assert_allclose(run.multipliers, run.q[:, 1], rtol=1e-12)  # λ = ∂U/∂z, all that acts on z
     assert drift(run) < DRIFT
-    by_arrays = jax.jit(rebuilt(system, "array").acceleration)(run.q[1], run.qdot[1])
-    np.testing.assert_allclose(system.acceleration(run.q[1], run.qdot[1]), by_arrays, rtol=1e-13)
+    by_arrays = jax.jit(rebuilt(HELD_WITHOUT_MASS, "array").acceleration)(run.q[1], run.qdot[1])
+    np.testing.assert_allclose(HELD_WITHOUT_MASS.acceleration(run.q[1], run.qdot[1]), by_arrays, rtol=1e-13)
 
 
 @pytest.mark.slow
@@ -530,6 +532,7 @@ def parallelogram(a, qdot):
 
 
 PARALLELOGRAM = lagjax.System(parallelogram)
+TURNING_LADDER = lagjax.System(lambda a, v: ladder(jnp.stack([a, GROUND[1], a, a, a]), jnp.stack([v, 0, v, v, v])))
 
 
 @pytest.mark.slow
@@ -620,9 +623,8 @@ def closed_ladder(q):
 def test_a_linkage_held_by_more_bars_than_it_needs():
     # Six constraints on five coordinates, four of them independent.
     system = lagjax.System(ladder, constraints=closed_ladder)
-    minimal = lagjax.System(lambda a, v: ladder(jnp.stack([a, GROUND[1], a, a, a]), jnp.stack([v, 0, v, v, v])))
     ts, start, lean = np.linspace(0, 0.5, 3), 1.4, GROUND[1]
-    free = lagjax.simulate(minimal, start, 0.4, ts, rtol=1e-11)
+    free = lagjax.simulate(TURNING_LADDER, start, 0.4, ts, rtol=1e-11)
     q0, qdot0 = np.array([start, lean, start, start, start]), np.array([0.4, 0, 0.4, 0.4, 0.4])
     run = lagjax.simulate(system, q0, qdot0, ts, rtol=1e-11)
     np.testing.assert_allclose(run.q, np.stack([free.q, lean + 0 * free.q, *[free.q] * 3], axis=1), atol=1e-9)
@@ -726,6 +728,9 @@ def bow(q):
 
 
 TWO_MASSES = lagjax.System(two_masses, constraints=bow)
+TORN_VELOCITIES = lagjax.System(free_particles, velocity_constraints=lambda q, v: jnp.stack([v[0], v[0] - q[0]]))
+NOWHERE = lagjax.System(weight, constraints=lambda q: 1 + q[0] ** 2)
+HERE_AND_THERE = lagjax.System(weight, constraints=lambda q: {"here": q[0], "there": q[0] - 1.0})
 
 
 @pytest.mark.slow
@@ -789,8 +794,9 @@ def test_projection_has_the_derivatives_of_its_closed_form(reverse):
 
 
 def test_velocities_that_cannot_be_met_have_nan_for_derivatives():
-    torn = lagjax.System(free_particles, velocity_constraints=lambda q, v: jnp.stack([v[0], v[0] - q[0]]))
-    velocity, slope = jax.jvp(jax.jit(lambda q: torn.project(q, jnp.zeros(2))[1]), (np.ones(2),), (np.ones(2),))
+    velocity, slope = jax.jvp(
+        jax.jit(lambda q: TORN_VELOCITIES.project(q, jnp.zeros(2))[1]), (np.ones(2),), (np.ones(2),)
+    )
     assert np.isnan(velocity).all() and np.isnan(slope).all()
 
 
@@ -815,10 +821,8 @@ def test_projection_of_moving_and_velocity_constraints():
 
 @pytest.mark.slow
 def test_projection_is_nan_where_there_is_nothing_to_find():
-    system = lagjax.System(weight, constraints=lambda q: 1 + q[0] ** 2)
-    assert np.isnan(system.project(np.array([0.7, 0.2]), np.zeros(2))[0]).all()
-    torn = lagjax.System(weight, constraints=lambda q: {"here": q[0], "there": q[0] - 1.0})
-    assert np.isnan(torn.project(np.zeros(2), np.zeros(2))[0]).all()
+    assert np.isnan(NOWHERE.project(np.array([0.7, 0.2]), np.zeros(2))[0]).all()
+    assert np.isnan(HERE_AND_THERE.project(np.zeros(2), np.zeros(2))[0]).all()
 
 
 # ---- what is refused -------------------------------------------------------------------------------------------------
@@ -866,6 +870,7 @@ LINKS = lagjax.System(  # coordinates that are deviations from a drawn pose begi
     constraints=lambda q, params: params[0] + q[0] + params[1] - q[1] - params[2],
     velocity_constraints=lambda q, v, params: params[0] + v[1] + params[1] - v[2] - params[2],
 )
+GIVEN_MASSES = lagjax.System(lambda q, v, params: 0.5 * v @ params @ v - q[1], constraints=lambda q: jnp.sum(q) - 3.0)
 METRES = [(metre, np.array([0.1, 0.2, 0.3]) * metre, 1e-12 * metre * np.eye(3)[0]) for metre in (1.0, 1e-10, 1e11)]
 
 
@@ -915,10 +920,9 @@ def test_signatures_and_names_that_are_refused():
 @pytest.mark.parametrize("first", [1.3, pytest.param(-1.3, marks=pytest.mark.slow)])
 def test_a_constrained_mass_matrix_among_the_parameters(first):
     """In machine code where it is positive definite as given; else diffrax pivots, and `explain` says why."""
-    scene = lagjax.System(lambda q, v, params: 0.5 * v @ params @ v - q[1], constraints=lambda q: jnp.sum(q) - 3.0)
     mass, ones = np.diag([first, 2.0, 3.0]) + 0.1, np.ones((1, 3))
     pull = np.linalg.solve(np.block([[mass, ones.T], [ones, np.zeros((1, 1))]]), [0.0, -1.0, 0.0, 0.0])[:3]
-    run = lagjax.simulate(scene, np.ones(3), np.array([1.0, -1.0, 0.0]), np.array([0.0, 1.0]), mass)
+    run = lagjax.simulate(GIVEN_MASSES, np.ones(3), np.array([1.0, -1.0, 0.0]), np.array([0.0, 1.0]), mass)
     np.testing.assert_allclose(run.q[-1], np.array([2.0, 0.0, 1.0]) + pull / 2, atol=1e-9)
-    said = str(scene.explain(np.ones(3), np.zeros(3), params=mass))
+    said = str(GIVEN_MASSES.explain(np.ones(3), np.zeros(3), params=mass))
     assert ("Taylor series in machine code" if first > 0 else "needs pivoting") in said

@@ -38,6 +38,8 @@ EVERY = {
     name: SHIFTED.get(name) or getattr(lax, row.lax or name)
     for name, row in OPERATIONS.items() if name in SHIFTED or not row.is_step
 }  # fmt: skip
+HYPERBOLA = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q: (0.5 * (q[0] * q[1])) ** 2 - 1.0)
+ZERO_ANGLE = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q + 0.0 * jnp.arctan2(q[1], q[0]))
 
 
 def test_every_operation_for_many_states_at_once_and_its_transpose():
@@ -134,9 +136,8 @@ def test_powers_have_derivatives_where_their_products_and_roots_have_none():
 
 def test_derivatives_of_powers_of_multiples():
     # (c u)² is known as c² u², in which c u no longer appears; its derivative is that of the power.
-    system = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q: (0.5 * (q[0] * q[1])) ** 2 - 1.0)
     q, v = np.array([[1.0, 2.0]]), np.array([[0.3, -0.6]])
-    values = of(system, q[0], v[0])
+    values = of(HYPERBOLA, q[0], v[0])
     values = values.evaluate(["jacobian", "rates", "gamma"], columns_of(q, v, 0.0, []))
     np.testing.assert_allclose(values["jacobian"], [[[2.0, 1.0]]], rtol=1e-15)
     np.testing.assert_allclose(values["rates"], [[0.0]], atol=1e-15)
@@ -191,7 +192,7 @@ def test_check_and_health_compile_nothing_where_there_are_programs(monkeypatch):
         raise AssertionError("compiled by XLA")
 
     monkeypatch.setattr(many_states, "_evaluate_compiled", compiled)
-    monkeypatch.setattr(of_check, "_variation", compiled)
+    monkeypatch.setattr(of_check, "_acceleration_slopes", compiled)
     monkeypatch.setattr(of_health, "_measure_traced", compiled)
     for make in (scenes.rolling_cylinder, scenes.damped_driven_oscillator):
         scene = make()
@@ -220,13 +221,12 @@ def test_a_state_without_a_compiler_is_the_compiled_one():
 
 def test_what_is_zero_is_folded_away_for_the_acceleration_too():
     # The angle has no derivative at the origin, and 0 times it does not need one: as in the motion.
-    system = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q + 0.0 * jnp.arctan2(q[1], q[0]))
     q, v = jnp.zeros(2), jnp.array([1.0, 0.5])
-    assert lagjax.simulate(system, q, v, np.array([0.0, 1.0])).ok
-    for acceleration in (system.acceleration, jax.jit(system.acceleration)):
+    assert lagjax.simulate(ZERO_ANGLE, q, v, np.array([0.0, 1.0])).ok
+    for acceleration in (ZERO_ANGLE.acceleration, jax.jit(ZERO_ANGLE.acceleration)):
         np.testing.assert_array_equal(acceleration(q, v), np.zeros(2))
-    np.testing.assert_array_equal(jax.vmap(system.acceleration)(q[None], v[None]), np.zeros((1, 2)))
-    np.testing.assert_allclose(jax.jacfwd(system.acceleration)(q, v), -np.eye(2))
+    np.testing.assert_array_equal(jax.vmap(ZERO_ANGLE.acceleration)(q[None], v[None]), np.zeros((1, 2)))
+    np.testing.assert_allclose(jax.jacfwd(ZERO_ANGLE.acceleration)(q, v), -np.eye(2))
 
 
 # ---- explain says what runs ------------------------------------------------------------------------------------------
@@ -282,6 +282,7 @@ SCENES = {
     ),
     "a function that cannot be hashed": (lagjax.System(Unhashable()), np.ones(2), "machine code", ""),
 }  # fmt: skip
+SINGULAR_AT_A_TIE = lagjax.System(lambda q, v: v[0] * v[1] + (q[0] - q[1]) * v[2] ** 2 - v[2] * v[1] * 0.0 - q @ q)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -340,8 +341,9 @@ def test_a_mass_matrix_that_is_a_series_in_weak_forces_is_positive_definite():
 
 
 def test_an_indefinite_mass_matrix_that_is_singular_is_found():
-    system = lagjax.System(lambda q, v: v[0] * v[1] + (q[0] - q[1]) * v[2] ** 2 - v[2] * v[1] * 0.0 - q @ q)
-    *found, singular = of(system, np.ones(3), np.ones(3)).accelerations.program.evaluate(0.4, 0.4, 0.1, *[0.2] * 3, 0.0)
+    *found, singular = of(SINGULAR_AT_A_TIE, np.ones(3), np.ones(3)).accelerations.program.evaluate(
+        0.4, 0.4, 0.1, *[0.2] * 3, 0.0
+    )
     assert singular and np.isnan(found).any()
 
 

@@ -28,6 +28,8 @@ FAST = [make for make in KINDS if make not in (scenes.chaplygin_sleigh, scenes.c
 SPECIAL = lagjax.System(
     lambda q, v: 0.5 * jnp.sum(v**2) - jnp.sum(jax.scipy.special.betainc(2.0, 3.0, q)), path="scalar"
 )
+INDEFINITE = lagjax.System(lambda q, v: v[0] * v[1] + v[2] * v[0] + 0.5 * v[2] ** 2 - 0.5 * jnp.sum(q**2))
+COMPLEX_STIFFNESS = lagjax.System(lambda q, v, params: 0.5 * v @ v - 0.5 * jnp.abs(params["z"]) ** 2 * q @ q)
 
 
 # Beside these every third scene: the motions of all, by the scalar form, are held to their laws in tests/scenes.
@@ -100,11 +102,10 @@ def test_both_forms_find_a_singular_mass_matrix(lagrangian):
 
 def test_an_indefinite_mass_matrix():
     # L = ẋẏ + żẋ + ½ ż² − U: regular, with a zero on the diagonal of M.
-    scene = lagjax.System(lambda q, v: v[0] * v[1] + v[2] * v[0] + 0.5 * v[2] ** 2 - 0.5 * jnp.sum(q**2))
     q = np.array([0.3, 0.7, 0.2])
-    assert scene.explain(q, q).path == "scalar"
+    assert INDEFINITE.explain(q, q).path == "scalar"
     mass = np.array([[0, 1, 1], [1, 0, 0], [1, 0, 1]])
-    end = lagjax.simulate(scene, q, np.zeros(3), np.array([0.0, 1e-3]))
+    end = lagjax.simulate(INDEFINITE, q, np.zeros(3), np.array([0.0, 1e-3]))
     np.testing.assert_allclose(end.qdot[-1] / 1e-3, -np.linalg.solve(mass, q), rtol=1e-5)
 
 
@@ -190,6 +191,7 @@ def test_explain_prints():
 @pytest.mark.filterwarnings("error::numpy.exceptions.ComplexWarning")
 @pytest.mark.filterwarnings("ignore:Complex dtype support in Diffrax")
 def test_parameters_may_be_complex():
-    system = lagjax.System(lambda q, v, params: 0.5 * v @ v - 0.5 * jnp.abs(params["z"]) ** 2 * q @ q)
-    run = lagjax.simulate(system, np.ones(2), np.zeros(2), np.linspace(0.0, np.pi, 3), {"z": np.array(0.6 + 0.8j)})
+    run = lagjax.simulate(
+        COMPLEX_STIFFNESS, np.ones(2), np.zeros(2), np.linspace(0.0, np.pi, 3), {"z": np.array(0.6 + 0.8j)}
+    )
     np.testing.assert_allclose(run.q[-1], [-1.0, -1.0], rtol=1e-7)

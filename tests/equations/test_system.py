@@ -25,6 +25,12 @@ def central(q, qdot, params):
 
 
 CENTRAL = lagjax.System(central)
+GROWING_MASS = lagjax.System(lambda q, qdot, t: 0.5 * (1 + t**2) * qdot**2 - 0.5 * 3.0 * q**2)
+PUSHED_AND_BRAKED = lagjax.System(
+    lambda q, qdot: 0.5 * 2.0 * jnp.sum(qdot**2),
+    forces=lambda q, qdot, t, params: params * jnp.array([t, 1.0]),
+    dissipation=lambda q, qdot: 0.5 * 0.3 * qdot[0] ** 2,
+)
 
 
 PARAMS = {"m": 2.0, "k": 3.0}
@@ -48,21 +54,15 @@ def test_central_force_by_hand():
 
 def test_time_dependence_enters_through_the_momentum():
     # L = ½ m(t) q̇² − ½ k q²  gives  m q̈ = −k q − ṁ q̇, with m = 1 + t²; h = ½ m q̇² + ½ k q².
-    scene = lagjax.System(lambda q, qdot, t: 0.5 * (1 + t**2) * qdot**2 - 0.5 * 3.0 * q**2)
     q, v, t = 0.4, 1.3, 0.8
-    np.testing.assert_allclose(scene.acceleration(q, v, t), (-3.0 * q - 2 * t * v) / (1 + t**2), rtol=1e-15)
-    np.testing.assert_allclose(scene.energy(q, v, t), 0.5 * (1 + t**2) * v**2 + 1.5 * q**2, rtol=1e-15)
+    np.testing.assert_allclose(GROWING_MASS.acceleration(q, v, t), (-3.0 * q - 2 * t * v) / (1 + t**2), rtol=1e-15)
+    np.testing.assert_allclose(GROWING_MASS.energy(q, v, t), 0.5 * (1 + t**2) * v**2 + 1.5 * q**2, rtol=1e-15)
 
 
 def test_forces_and_dissipation_add_up():
-    scene = lagjax.System(
-        lambda q, qdot: 0.5 * 2.0 * jnp.sum(qdot**2),
-        forces=lambda q, qdot, t, params: params * jnp.array([t, 1.0]),
-        dissipation=lambda q, qdot: 0.5 * 0.3 * qdot[0] ** 2,
-    )
     q, v = np.zeros(2), np.array([1.0, 2.0])
-    np.testing.assert_allclose(scene.acceleration(q, v, 4.0, 5.0), [(20.0 - 0.3) / 2, 2.5], rtol=1e-15)
-    np.testing.assert_allclose(scene.generalized_force(q, v, 4.0, 5.0), [20.0 - 0.3, 5.0], rtol=1e-15)
+    np.testing.assert_allclose(PUSHED_AND_BRAKED.acceleration(q, v, 4.0, 5.0), [(20.0 - 0.3) / 2, 2.5], rtol=1e-15)
+    np.testing.assert_allclose(PUSHED_AND_BRAKED.generalized_force(q, v, 4.0, 5.0), [20.0 - 0.3, 5.0], rtol=1e-15)
 
 
 def test_indefinite_but_regular_mass_matrix():

@@ -582,6 +582,7 @@ DECAYING = lagjax.System(
     spring,
     forces=lambda q, qdot, params: -params["c"] * qdot,
 )
+MANY_WEIGHTS = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * (1.0 + jnp.mean(params["w"])) * q**2)
 
 
 def test_with_nothing_free_starts_and_noise_are_fitted():
@@ -639,11 +640,10 @@ def test_transforms_by_element():
 
 @pytest.mark.slow
 def test_a_fit_of_very_many_numbers_names_the_method_that_is_meant_for_it():
-    scene = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * (1.0 + jnp.mean(params["w"])) * q**2)
     ts = np.linspace(0.0, 2.0, 21)
     record = lagjax.Record(ts, np.cos(1.1 * ts), start=(1.0, 0.0))
     with pytest.warns(UserWarning, match=r"101 numbers are free.*method='gradient'"):
-        lagjax.fit(scene, record, {"w": np.full(101, 0.1)}, method="whole")
+        lagjax.fit(MANY_WEIGHTS, record, {"w": np.full(101, 0.1)}, method="whole")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        lagjax.fit(scene, record, {"w": np.full(50, 0.1)}, method="whole")
+        lagjax.fit(MANY_WEIGHTS, record, {"w": np.full(50, 0.1)}, method="whole")

@@ -52,7 +52,7 @@ def test_a_trial_is_that_of_the_closed_form_and_one_that_is_not_finite_says_wher
     residuals, starts = joint.residual_function, joint.states + 0.01
     trial = residuals.evaluate(Point(joint.u + 0.05, starts))
     # Of the spring, less the measurements, by its start and by k.
-    q, slope = (f(starts[0, :2], joint.u[1] + 0.05) for f in (swing, jax.jacfwd(swing, argnums=(0, 1))))
+    q, slope = (jax.jit(f)(starts[0, :2], joint.u[1] + 0.05) for f in (swing, jax.jacfwd(swing, argnums=(0, 1))))
     np.testing.assert_allclose(trial.residuals[0][0, :, 0], q - records()["one"].values, atol=1e-7)
     np.testing.assert_allclose(trial.slopes[0][0, :, 0, :2], slope[0], atol=1e-7)
     np.testing.assert_allclose(trial.slopes[0][0, :, 0, 5], slope[1], atol=1e-7)

@@ -177,6 +177,8 @@ def spring(q, qdot, params):
 
 
 SPRING = lagjax.System(spring, forces=lambda q, v, params: -params["c"] * v)
+TWO_MINIMA = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * (2 + jnp.cos(3 * params) + 0.1 * params) * q**2)
+DRIVEN_SPRING = lagjax.System(spring, forces=lambda q, v, params, inputs: inputs - params["c"] * v)
 SHORT = np.linspace(0.0, 3.0, 61)
 
 
@@ -253,10 +255,9 @@ def test_256_starts_come_to_the_same_again():
 
 def test_many_starts_find_the_deeper_of_two_minima():
     # A stiffness that rises and falls with x: from 1.0 the way down ends at the bound.
-    scene = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * (2 + jnp.cos(3 * params) + 0.1 * params) * q**2)
-    q = np.asarray(lagjax.simulate(scene, 1.0, 0.0, TS, 2.2).q)
+    q = np.asarray(lagjax.simulate(TWO_MINIMA, 1.0, 0.0, TS, 2.2).q)
     one = lagjax.Record(TS, q + 0.01 * np.random.default_rng(0).normal(size=q.shape))
-    stuck, fit = (lagjax.fit(scene, one, 1.0, transforms=lagjax.between(0.8, 4.0), starts=k) for k in (1, 8))
+    stuck, fit = (lagjax.fit(TWO_MINIMA, one, 1.0, transforms=lagjax.between(0.8, 4.0), starts=k) for k in (1, 8))
     assert stuck.rms["q"] > 0.3 and fit.rms["q"] < 0.012
 
 
@@ -383,8 +384,7 @@ def test_inputs_drive_the_density_and_many_starts():
     truth = lagjax.System(spring, forces=lambda q, v, t, params: lagjax.samples(ts, push)(t) - 0.3 * v)
     q = np.asarray(lagjax.simulate(truth, 1.0, 0.0, ts, {"k": 4.0}).q)
     one = lagjax.Record(ts, q + 0.01 * rng.normal(size=q.shape), inputs=push)
-    scene = lagjax.System(spring, forces=lambda q, v, params, inputs: inputs - params["c"] * v)
-    fit = lagjax.fit(scene, one, {"k": 0.3, "c": 0.2}, transforms=lagjax.positive, starts=8)
+    fit = lagjax.fit(DRIVEN_SPRING, one, {"k": 0.3, "c": 0.2}, transforms=lagjax.positive, starts=8)
     assert fit.params["k"] == pytest.approx(4.0, rel=0.02) and fit.params["c"] == pytest.approx(0.3, rel=0.1)
     density = fit.log_density()
     value, x = jax.jit(density), density.first + 0.01 * rng.normal(size=len(density))

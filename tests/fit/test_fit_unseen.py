@@ -249,6 +249,9 @@ def two_pendulums(q, qdot, params):
 
 
 CHAOTIC = lagjax.System(two_pendulums)
+DAMPED_SWING = lagjax.System(
+    lambda q, v, params: 0.5 * v**2 + params["w2"] * jnp.cos(q), forces=lambda q, v, params: -params["c"] * v
+)
 TRUTH = {"l": np.array([1.0, 0.8]), "m": np.array([1.0, 0.6]), "more": 0.0}
 HIGH = np.array([2.0, 2.5]), np.zeros(2)
 
@@ -285,14 +288,11 @@ def test_one_parameter_that_a_chaotic_record_cannot_tell_has_no_interval():
 def test_a_swing_that_noise_gives_says_nothing_of_its_frequency():
     # A pendulum that hangs still, one that swings by half of the noise, and one that rests beside one that moves.
     ts, rng = np.linspace(0.0, 10.0, 501), np.random.default_rng(1)
-    scene = lagjax.System(
-        lambda q, v, params: 0.5 * v**2 + params["w2"] * jnp.cos(q), forces=lambda q, v, params: -params["c"] * v
-    )
-    exact = np.asarray(lagjax.simulate(scene, 1.0, 0.0, ts, {"w2": 9.0, "c": 0.1}).q)
+    exact = np.asarray(lagjax.simulate(DAMPED_SWING, 1.0, 0.0, ts, {"w2": 9.0, "c": 0.1}).q)
 
     def found(*sizes, law=None, start=None):
         records = [lagjax.Record(ts, x * exact + 0.005 * rng.normal(size=501), start=start) for x in sizes]
-        return lagjax.fit(scene, records, {"w2": 7.0, "c": 0.2}, transforms=lagjax.positive, noise=law)
+        return lagjax.fit(DAMPED_SWING, records, {"w2": 7.0, "c": 0.2}, transforms=lagjax.positive, noise=law)
 
     still = [found(0.0) for _ in range(12)] + [found(0.0, law=lagjax.StudentT()), found(0.0, 0.0)]
     assert sum(fit.ok for fit in still) <= 1

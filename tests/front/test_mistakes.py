@@ -54,6 +54,7 @@ def test_functions_that_ask_for_values_are_told_what_to_write(height):
 
 
 SPRING = lagjax.System(lambda q, v, params: 0.5 * params["m"] * v**2 - 0.5 * q**2)
+NETWORK = lagjax.System(lambda q, v, params: 0.5 * v**2 - params(q[None]))
 MASS, TS = {"m": 1.0}, np.linspace(0.0, 1.0, 3)
 BALL = lagjax.Hybrid(
     {"f": RAMP},
@@ -79,7 +80,10 @@ BALL = lagjax.Hybrid(
             lambda: _sweep(TS, {"section": lambda q, v: q}),
             r"ask for them by name: write keep\(trajectory",
         ),
-        (lambda: lagjax.simulate_batch(OSCILLATORS, jnp.ones((3, 2)), jnp.ones((3, 2)), jnp.ones((3, 5))), "jax.vmap"),
+        (
+            lambda: lagjax.simulate_batch(OSCILLATORS, jnp.ones((3, 2)), jnp.ones((3, 2)), jnp.ones((3, 5))),
+            r"not between ts\[0, 0\]",
+        ),
         (
             lambda: lagjax.normal_modes(OSCILLATORS, jnp.zeros(2), jnp.ones(2)),
             "asks for params, .* name velocities, qdot=",
@@ -154,10 +158,9 @@ def test_a_hybrid_is_taken_where_a_motion_is_followed():
 def test_networks_in_a_batch():
     keys = jax.random.split(jax.random.key(0), 3)
     nets = eqx.filter_vmap(lambda key: eqx.nn.MLP(1, "scalar", 4, 1, key=key))(keys)
-    system = lagjax.System(lambda q, v, params: 0.5 * v**2 - params(q[None]))
-    batch = lagjax.simulate_batch(system, np.ones(3), np.zeros(3), TS, nets, batch_axes=(0, 0, 0))
+    batch = lagjax.simulate_batch(NETWORK, np.ones(3), np.zeros(3), TS, nets, batch_axes=(0, 0, 0))
     one = jax.tree.map(lambda leaf: leaf[2] if eqx.is_array(leaf) else leaf, nets)
-    run = lagjax.simulate(system, 1.0, 0.0, TS, one)
+    run = lagjax.simulate(NETWORK, 1.0, 0.0, TS, one)
     np.testing.assert_allclose(batch.q[2], run.q, rtol=1e-12)
     np.testing.assert_allclose(batch.energy()[2], run.energy(), rtol=1e-12)
 

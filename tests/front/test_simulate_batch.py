@@ -15,6 +15,9 @@ def pendulum(q, qdot, params):
 
 
 SCENE = lagjax.System(pendulum)
+TWO_STIFFNESSES = lagjax.System(lambda q, qdot: 0.5 * jnp.sum(qdot**2) - 0.5 * jnp.sum(jnp.array([1.0, 4.0]) * q**2))
+ENDS_AT_ZERO = lagjax.System(lambda q, qdot, params: 0.5 * params * qdot**2 - jnp.sqrt(q))
+FREE_POINT_AND_ANGLE = lagjax.System(lambda q, qdot: 0.5 * jnp.sum(qdot["r"] ** 2) + 0.5 * qdot["phi"] ** 2)
 PARAMS = {"l": 0.7, "g": 9.81}
 TS = np.linspace(0.0, 2.0, 5)
 Q0, QDOT0 = jnp.linspace(-2.5, 2.5, 8), jnp.linspace(-1.0, 1.0, 8)
@@ -58,9 +61,8 @@ def test_batch_over_parameters_only():
 
 
 def test_batch_axis_in_the_middle_of_arrays():
-    scene = lagjax.System(lambda q, qdot: 0.5 * jnp.sum(qdot**2) - 0.5 * jnp.sum(jnp.array([1.0, 4.0]) * q**2))
     q0 = np.stack([Q0, QDOT0])  # coordinates first, members second
-    batch = lagjax.simulate_batch(scene, q0, np.zeros((8, 2)), TS, batch_axes=(1, 0, None))
+    batch = lagjax.simulate_batch(TWO_STIFFNESSES, q0, np.zeros((8, 2)), TS, batch_axes=(1, 0, None))
     expected = q0.T[:, None, :] * np.cos(np.array([1.0, 2.0]) * TS[:, None])
     np.testing.assert_allclose(batch.q, expected, atol=1e-8)
 
@@ -77,9 +79,8 @@ def test_a_bad_member_is_reported_and_changes_nothing_for_the_others():
 
 
 def test_a_bad_parameter_and_a_member_that_fails_on_the_way():
-    scene = lagjax.System(lambda q, qdot, params: 0.5 * params * qdot**2 - jnp.sqrt(q))
     q0, params = np.array([1.0, 1.0, 9.0, 9.0]), np.array([0.0, 1.0, 1.0, np.nan])
-    batch = lagjax.simulate_batch(scene, q0, -np.ones(4), TS, params, batch_axes=(0, 0, 0))
+    batch = lagjax.simulate_batch(ENDS_AT_ZERO, q0, -np.ones(4), TS, params, batch_axes=(0, 0, 0))
     np.testing.assert_array_equal(batch.ok, [False, False, True, False])
     assert (batch.result == lagjax.RESULTS.mass_matrix_singular)[0]
     assert (batch.result == lagjax.RESULTS.nonfinite_state)[1] and 0 < batch.end.t[1] < 2  # the root of less than zero
@@ -100,9 +101,8 @@ def test_large_batches_of_products_are_right(members, n):
 
 def test_to_xarray():
     xarray = pytest.importorskip("xarray")
-    scene = lagjax.System(lambda q, qdot: 0.5 * jnp.sum(qdot["r"] ** 2) + 0.5 * qdot["phi"] ** 2)
     q0 = {"r": jnp.ones((8, 3)), "phi": Q0}
-    labelled = lagjax.simulate_batch(scene, q0, q0, TS).to_xarray()
+    labelled = lagjax.simulate_batch(FREE_POINT_AND_ANGLE, q0, q0, TS).to_xarray()
     assert isinstance(labelled, xarray.Dataset)
     assert labelled["q.r"].dims == ("member", "time", "q.r_0") and labelled["qdot.phi"].shape == (8, 5)
     one = lagjax.simulate(SCENE, 0.3, 0.0, TS, PARAMS).to_xarray()

@@ -63,6 +63,7 @@ ROLLING = {
 }
 SOFT = lagjax.System(lambda q, v, params: 0.5 * v**2 - params["g"] * q - 0.5 * 1e3 * q**2)
 PLANE = lagjax.System(lambda q, v: 0.5 * v @ v)
+BALLS = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - G * jnp.sum(q))
 LEAVE = lagjax.Transition("rolling", "flight", lambda q, v, multipliers: multipliers["contact"], direction=-1)
 ROLL_TS = np.linspace(0.0, 3.0, 13)
 
@@ -402,10 +403,9 @@ def test_a_guard_that_only_jumps_is_crossed_once(guard):
 
 @pytest.mark.slow
 def test_two_balls_that_land_at_the_same_instant_both_bounce():
-    scene = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - G * jnp.sum(q))
     first = lagjax.Transition("f", "f", lambda q, v: q[0], -1, lambda q, v: (q, v.at[0].multiply(-0.8)))
     second = lagjax.Transition("f", "f", lambda q, v: q[1], -1, lambda q, v: (q, v.at[1].multiply(-0.8)))
-    run = hybrid({"f": scene}, [first, second], jnp.ones(2), jnp.zeros(2), (0.0, 1.0, 1.8))
+    run = hybrid({"f": BALLS}, [first, second], jnp.ones(2), jnp.zeros(2), (0.0, 1.0, 1.8))
     one = bounce_times(1.0, 0.8, G, 3)
     np.testing.assert_allclose(times(run), np.repeat(one[one < 1.8], 2), rtol=1e-12)
     np.testing.assert_allclose(run.q[:, 0], run.q[:, 1], rtol=1e-12)

@@ -23,6 +23,25 @@ CARRIED = lagjax.System(
     lambda q, v: 0.5 * v @ v,
     forces=lambda q, v, params: jnp.array([-params["mu"] * jnp.sign(v[0] - params["belt"]), 0.0]),
 )
+SLIDES_ALONG_A_LINE = lagjax.System(
+    lambda q, v: 0.5 * v @ v,
+    forces=lambda q, v, params: -params[0] * jnp.sign(v + params[1] * q) - 0.3 * q[::-1],
+)
+CORNER_WITH_FRICTION = lagjax.System(
+    lambda q, v: 0.5 * v * v,
+    forces=lambda q, v, params: params[1] - 2.0 * jnp.sign(q - params[0]) - params[2] * jnp.sign(v),
+)
+SLOPE_WITH_FRICTION = lagjax.System(
+    lambda q, v, params: 0.5 * v * v - params[0] * q, forces=lambda q, v, params: -params[1] * jnp.sign(v)
+)
+ROOT_BESIDE_FRICTION = lagjax.System(
+    lambda q, v: 0.5 * v**2,
+    forces=lambda q, v, params: params * jnp.sign(v) - jnp.sign(q) * jnp.sqrt(jnp.abs(q) + 0.1),
+)
+TWO_SPELLINGS = lagjax.System(
+    lambda q, v: 0.5 * v**2,
+    forces=lambda q, v, params: 0.8 - jnp.sign(v) + 0.6 * jnp.where(v / params > 0, 1.0, 0.0),
+)
 X = {"v": np.array([0.5, -1.0, 0.0]), "belt": 0.5, "c": np.array([0.0, 1.0, 0.0]), "load": 0.25}
 Q = np.array([0.0, 1.0, 0.0])
 
@@ -86,18 +105,14 @@ def test_second_derivatives_exist_along_the_border_alone(inner, outer):
 @pytest.mark.slow
 def test_a_second_run_from_the_end_of_the_first():
     """Start and border move together there: second derivatives exist, and are those of one run."""
-    scene = lagjax.System(
-        lambda q, v: 0.5 * v @ v,
-        forces=lambda q, v, params: -params[0] * jnp.sign(v + params[1] * q) - 0.3 * q[::-1],
-    )
     q0, v0 = np.array([0.5, -0.3]), np.array([0.7, 0.1])
 
     def once(x):
-        return jnp.sum(lagjax.simulate(scene, q0, v0, 2 * TS, x).q[-1] ** 2)
+        return jnp.sum(lagjax.simulate(SLIDES_ALONG_A_LINE, q0, v0, 2 * TS, x).q[-1] ** 2)
 
     def twice(x):
-        run = lagjax.simulate(scene, q0, v0, TS, x)
-        return jnp.sum(lagjax.simulate(scene, run.q[-1], run.qdot[-1], TS, x).q[-1] ** 2)
+        run = lagjax.simulate(SLIDES_ALONG_A_LINE, q0, v0, TS, x)
+        return jnp.sum(lagjax.simulate(SLIDES_ALONG_A_LINE, run.q[-1], run.qdot[-1], TS, x).q[-1] ** 2)
 
     x = jnp.array([2.0, 0.6])
     for derivative in (jax.grad, jax.hessian, lambda f: jax.jacfwd(jax.jacfwd(f)), lambda f: jax.jacrev(jax.jacrev(f))):
@@ -127,13 +142,9 @@ def test_a_mode_that_begins_on_its_border():
 @pytest.mark.parametrize(("friction", "slopes"), [(0.5, [0.0, 0.0, 1.0, 0.0]), (2.5, [1.0, 0.0, 0.0, 0.0])])
 def test_a_body_in_a_corner_with_friction(friction, slopes):
     """Pushed by 2: from beside the corner it comes back to it in a time as the root of the way, or stays there."""
-    scene = lagjax.System(
-        lambda q, v: 0.5 * v * v,
-        forces=lambda q, v, params: params[1] - 2.0 * jnp.sign(q - params[0]) - params[2] * jnp.sign(v),
-    )
 
     def end(x):
-        return lagjax.simulate(scene, x[0], x[1], TS, x[2:]).q[-1]
+        return lagjax.simulate(CORNER_WITH_FRICTION, x[0], x[1], TS, x[2:]).q[-1]
 
     x = jnp.array([0.5, 0.0, 0.5, 0.25, friction])
     for derivative in (jax.jacfwd, jax.jacrev):
@@ -167,12 +178,9 @@ def test_nothing_that_rests_creeps():
 
 def test_what_has_come_to_rest_stays_there():
     """A block that slides down and stops, and where it does, by the end of the time and long after."""
-    scene = lagjax.System(
-        lambda q, v, params: 0.5 * v * v - params[0] * q, forces=lambda q, v, params: -params[1] * jnp.sign(v)
-    )
 
     def end(params, t):
-        return lagjax.simulate(scene, 0.0, 1.0, jnp.stack([0.0 * t, t]), params).q[-1]
+        return lagjax.simulate(SLOPE_WITH_FRICTION, 0.0, 1.0, jnp.stack([0.0 * t, t]), params).q[-1]
 
     params = np.array([0.7, 1.1])  # it stops after v²/2 (g + μ)
     np.testing.assert_allclose(end(params, 1e8), 0.5 / 1.8, rtol=1e-12)
@@ -236,22 +244,16 @@ def test_a_tie_that_a_motion_leaves_does_not_hold_it(potential, way):
 
 def test_a_force_without_a_value_beyond_its_border_leaves_friction_alone():
     """Compiles one motion: sign(q) √(|q| + c), on its other side, is the root of what is negative there."""
-    system = lagjax.System(
-        lambda q, v: 0.5 * v**2,
-        forces=lambda q, v, params: params * jnp.sign(v) - jnp.sign(q) * jnp.sqrt(jnp.abs(q) + 0.1),
-    )
-    held = lagjax.simulate(system, 0.25, 0.0, np.array([0.0, 1.0]), -0.75)
+    held = lagjax.simulate(ROOT_BESIDE_FRICTION, 0.25, 0.0, np.array([0.0, 1.0]), -0.75)
     assert held.q[-1] == 0.25
-    rough, smooth = (lagjax.simulate(system, 0.25, 0.5, np.array([0.0, 0.2]), mu).q[-1] for mu in (-0.75, 0.0))
+    rough, smooth = (
+        lagjax.simulate(ROOT_BESIDE_FRICTION, 0.25, 0.5, np.array([0.0, 0.2]), mu).q[-1] for mu in (-0.75, 0.0)
+    )
     assert 0.9 * 0.02 * 0.75 < smooth - rough < 1.1 * 0.02 * 0.75  # ½ μ t², but for what the spring does beside it
 
 
 @pytest.mark.parametrize(("scale", "moved"), [(2.0, 0.4), (-2.0, 0.0)])
 def test_two_spellings_of_one_border_push_together(scale, moved):
     """Compiles one motion: v = 0 and v / scale = 0 are one border, and 0.8 − 1 + 0.6 is left above it."""
-    system = lagjax.System(
-        lambda q, v: 0.5 * v**2,
-        forces=lambda q, v, params: 0.8 - jnp.sign(v) + 0.6 * jnp.where(v / params > 0, 1.0, 0.0),
-    )
-    run = lagjax.simulate(system, 0.0, 0.0, np.array([0.0, 1.0]), scale)
+    run = lagjax.simulate(TWO_SPELLINGS, 0.0, 0.0, np.array([0.0, 1.0]), scale)
     np.testing.assert_allclose(2 * run.q[-1], moved, atol=1e-14)

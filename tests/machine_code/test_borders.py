@@ -191,6 +191,7 @@ ABRUPT = {  # where a root begins at a border: there is no series beyond it
         (0.0, 1.0), lambda q, v, t: -q + 20 * np.sqrt(max(0.01 - (t - 5) ** 2, 0)), 0.01,
     ),
 }  # fmt: skip
+ATOM = lagjax.System(lambda q, v: 0.5 * v @ v - 4 * ((q @ q) ** -6 - (q @ q) ** -3))
 
 
 @pytest.mark.parametrize("rtol", TOLERANCES)
@@ -227,13 +228,12 @@ def test_what_powers_make_narrow_is_seen_by_guards_and_derivatives(width):
 
 
 def test_an_atom_is_hit_from_any_distance():
-    system = lagjax.System(lambda q, v: 0.5 * v @ v - 4 * ((q @ q) ** -6 - (q @ q) ** -3))
 
     def rate(t, y):
         return [*y[2:], *(48 * (y[:2] @ y[:2]) ** -7 - 24 * (y[:2] @ y[:2]) ** -4) * y[:2]]
 
     for distance in (1e2, 1e4, 1e6):
-        run = lagjax.simulate(system, np.array([-distance, 0.7]), np.array([2.0, 0.0]), np.array([0.0, distance]))
+        run = lagjax.simulate(ATOM, np.array([-distance, 0.7]), np.array([2.0, 0.0]), np.array([0.0, distance]))
         # A hundred diameters away the force is 24e-14.
         exact = solve_ivp(rate, (0, 100), [-100, 0.7, 2.0, 0.0], "DOP853", rtol=1e-12, atol=1e-12, max_step=0.5)
         np.testing.assert_allclose(run.qdot[-1], exact.y[2:, -1], atol=1e-8)
@@ -328,6 +328,7 @@ CARTESIAN = lagjax.System(
     forces=lambda q, v: -0.5 * jnp.sign(v[0]) * jnp.array([1.0, 0.0]),
 )  # fmt: skip
 ANGLE = lagjax.System(lambda a, w: 0.5 * w * w + 9.81 * jnp.cos(a), forces=lambda a, w: -0.5 * jnp.sign(w) * jnp.cos(a))
+HERTZ = lagjax.System(lambda q, v: 0.5 * v @ v - jnp.maximum(q[0] - q[1], 0.0) ** 2.5)
 
 
 def two_blocks():
@@ -533,7 +534,6 @@ def test_derivatives_of_a_cradle_that_is_struck(count, gap, power):
 
 def test_balls_at_rest_that_touch_have_derivatives_by_where_they_are():
     """By Hertz's law, whose slope is zero there."""
-    scene = lagjax.System(lambda q, v: 0.5 * v @ v - jnp.maximum(q[0] - q[1], 0.0) ** 2.5)
     for of in (jax.jacfwd, jax.jacrev):
-        found = of(lambda q: lagjax.simulate(scene, q, jnp.zeros(2), jnp.array([0.0, 1.0])).q[-1])(np.zeros(2))
+        found = of(lambda q: lagjax.simulate(HERTZ, q, jnp.zeros(2), jnp.array([0.0, 1.0])).q[-1])(np.zeros(2))
         np.testing.assert_array_equal(found, np.eye(2))

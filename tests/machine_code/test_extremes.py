@@ -9,6 +9,8 @@ import lagjax
 
 PENDULUM = lagjax.System(lambda q, v: 0.5 * v**2 + 9.81 * jnp.cos(q))
 CLOCK = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params**2 * q**2)
+SQUARE_DRAG = lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v: -v - jnp.abs(v) * v)
+TWO_SPRINGS = lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v: -jnp.where(q > 0, 4 * q, q))
 
 
 # ---- times -----------------------------------------------------------------------------------------------------------
@@ -50,17 +52,15 @@ def test_motions_that_die_out_towards_a_corner():
 
 
 def test_a_motion_that_died_out_long_ago():
-    system = lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v: -v - jnp.abs(v) * v)
-    found = lagjax.simulate(system, 0.0, 1.0, np.array([0.0, 1e6]))
+    found = lagjax.simulate(SQUARE_DRAG, 0.0, 1.0, np.array([0.0, 1e6]))
     np.testing.assert_allclose(found.q[-1], np.log(2.0), atol=1e-9)
     assert found.stats["num_steps"] < 1000
 
 
 @pytest.mark.parametrize("size", [1e-30, 1e-200])
 def test_a_border_is_crossed_with_any_amplitude(size):
-    system = lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v: -jnp.where(q > 0, 4 * q, q))
     ts = np.array([0.0, 1.0, 10 * (np.pi / 2 + np.pi)])
-    found = lagjax.simulate(system, size, 0.0, ts, atol=1e-13 * size)
+    found = lagjax.simulate(TWO_SPRINGS, size, 0.0, ts, atol=1e-13 * size)
     np.testing.assert_allclose(found.q[1:], size * np.array([2 * np.sin(np.pi / 4 - 1.0), 1.0]), rtol=1e-9)
 
 

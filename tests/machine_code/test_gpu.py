@@ -102,7 +102,10 @@ def agree(here, there, tolerance=1e-9):
 # ---- the numbers -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("form", [None, GpuForm(13, unrolled=True), GpuForm(13, unrolled=False)])
+@pytest.mark.parametrize(
+    "form",  # that of its own is unrolled, of a lower order
+    [None, pytest.param(GpuForm(13, unrolled=True), marks=pytest.mark.slow), GpuForm(13, unrolled=False)],
+)
 def test_a_batch_is_that_of_the_cpu(on_the_ptx, monkeypatch, form):
     scene = scenes.double_pendulum()
     q0 = np.random.default_rng(0).uniform(-1.0, 1.0, (7, 2))

@@ -135,3 +135,52 @@ def test_rows_of_many_numbers_stay_off_the_stack_of_a_thread():
     rows = np.concatenate([np.random.default_rng(0).normal(size=(9, 3)), np.ones((9, 100_000))], axis=1)
     found = jax.jit(lambda x: line(x))(rows)
     np.testing.assert_allclose(found, rows[:, :3] * np.sin(rows[:, :1]) + 1.0, rtol=1e-14)
+
+
+def test_what_rows_share_is_computed_once_with_the_same_digits():
+    """Inputs, floats and decisions of shared numbers alone, beside those of rows, in lanes and without."""
+
+    def function(x):
+        still, moving = x[:4], x[4:]
+        common, side = jnp.sin(still[0]) * jnp.exp(still[1]), still[2] > still[3]
+        rows = jnp.where(side, common * moving[0], moving[1] / (2.0 + common)) + jnp.cos(moving[2]) * still[3]
+        return jnp.stack([rows, still[2], common, jnp.where(still[0] > 0.5, 1.0, moving[0]), moving[1] * still[0], 0.0])
+
+    program, rng = lower(function, np.zeros(7)), np.random.default_rng(3)
+    rows, given = rng.uniform(0.1, 1.0, (21, 3)), rng.uniform(0.1, 1.0, 4)
+    for shared in ((0, 1, 2, 3), (0, 2)):
+        all_of = np.concatenate([np.broadcast_to(given, (21, 4)), rows], axis=1)
+        own = [i for i in range(7) if i not in shared]
+        for lanes in (1, 8):
+            code = LineCode(program.line, 7, lanes=lanes, shared=shared)
+            found = code(all_of[:, own], all_of[0, list(shared)])
+            np.testing.assert_array_equal(found, LineCode(program.line, 7)(all_of))
+
+
+@pytest.mark.slow
+def test_axes_of_rows_broadcast():
+    """Parts that rows share, in every order of batches; forward, reverse, and once more."""
+    parts = X[:2], X[2:]
+
+    def call(x, rest):
+        return LINE(x, rest)
+
+    def right(x, rest):
+        return function(jnp.concatenate([x, rest]))
+
+    x, rest = (np.random.default_rng(k).uniform(0.2, 1.0, (5, 2)) for k in (1, 2))
+    for of in (
+        lambda f: jax.vmap(f, (0, None))(x, parts[1]),
+        lambda f: jax.vmap(f, (None, 0))(parts[0], rest),
+        lambda f: jax.vmap(jax.vmap(f, (None, 0)), (0, None))(x, rest),
+        lambda f: jax.vmap(jax.jacfwd(f, (0, 1)), (0, None))(x, parts[1]),
+        lambda f: jax.vmap(jax.jacrev(f, (0, 1)), (None, 0))(parts[0], rest),
+        lambda f: jax.jacfwd(lambda x: jax.vmap(f, (None, 0))(x, rest))(parts[0]),
+        lambda f: jax.jacrev(lambda x: jax.vmap(f, (None, 0))(x, rest).sum(0))(parts[0]),
+        lambda f: jax.vmap(lambda x: jax.hessian(lambda x: f(x, parts[1]).sum())(x))(x),
+        lambda f: jax.vmap(jax.vmap(jax.jacrev(f), (0, None)), (None, 0))(x, rest),
+    ):
+        expected = jax.jit(lambda of=of: of(right))()
+        for found in (of(call), jax.jit(lambda of=of: of(call))()):
+            for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+                np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-13)

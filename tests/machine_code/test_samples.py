@@ -20,6 +20,7 @@ KNOTS -= KNOTS[0]
 VALUES = RNG.normal(size=12)
 END = np.array([0.0, KNOTS[-1]])
 MACHINE = lagjax.MachineCode()
+INTERPOLATED = lagjax.System(oscillator, forces=lambda q, qdot, t, params: jnp.interp(t, KNOTS, params))
 
 
 @pytest.fixture(autouse=True)
@@ -345,10 +346,9 @@ def test_steps_of_diffrax_end_at_knots(backward):
 
 @pytest.mark.slow
 def test_interpolation_of_jax_is_known():
-    scene = lagjax.System(oscillator, forces=lambda q, qdot, t, params: jnp.interp(t, KNOTS, params))
 
     def end(values):
-        return lagjax.simulate(scene, 0.3, 0.1, END, values, solver=MACHINE).q[-1]
+        return lagjax.simulate(INTERPOLATED, 0.3, 0.1, END, values, solver=MACHINE).q[-1]
 
     closed = lambda values: exact("linear", KNOTS, values)[0]
     np.testing.assert_allclose(end(VALUES), closed(VALUES), atol=1e-10)

@@ -305,6 +305,10 @@ STEPPED = lagjax.System(
         params[0] + params[1] * t - 4 * jnp.stack([f(v[i]) for i, f in enumerate(FUNCTIONS)])
     ),
 )
+STAIRS_OF_SPEEDS = lagjax.System(lambda q, v: 0.5 * v @ v, forces=lambda q, v, params: 0.3 - params * jnp.ceil(v))
+CORNER_AWAY_FROM_ZERO = lagjax.System(
+    lambda q, v: 0.5 * v * v, forces=lambda q, v, params: 3.0 - 4 * jnp.ceil(q - params) - 0.5 * jnp.sign(v)
+)
 
 
 def held_and_left(x, level, below, above, end):
@@ -352,10 +356,9 @@ def test_derivatives_along_borders_of_every_kind():
 
 @pytest.mark.parametrize("count", [2, pytest.param(10, marks=pytest.mark.slow)])
 def test_borders_that_are_come_to_at_one_instant_each_shift_their_own_tangents(count):
-    scene = lagjax.System(lambda q, v: 0.5 * v @ v, forces=lambda q, v, params: 0.3 - params * jnp.ceil(v))
 
     def ends(v0):
-        return lagjax.simulate(scene, jnp.zeros(count), v0, jnp.array([0.0, 2.0]), 1.5).q[-1]
+        return lagjax.simulate(STAIRS_OF_SPEEDS, jnp.zeros(count), v0, jnp.array([0.0, 2.0]), 1.5).q[-1]
 
     # Down to v = 0 with 1.2, to rest there: q = v0² / 2.4.
     np.testing.assert_allclose(ends(np.full(count, 0.9)), 0.81 / 2.4, atol=1e-10)
@@ -364,12 +367,9 @@ def test_borders_that_are_come_to_at_one_instant_each_shift_their_own_tangents(c
 
 def test_a_corner_away_from_zero_is_rested_in():
     """Bounces end where rounding of the place hides them; at rest from the start, too."""
-    scene = lagjax.System(
-        lambda q, v: 0.5 * v * v, forces=lambda q, v, params: 3.0 - 4 * jnp.ceil(q - params) - 0.5 * jnp.sign(v)
-    )
     for level in (0.7, 100.0):
         for q0, v0 in ((level + 0.2, 0.3), (level, 0.0)):
-            run = lagjax.simulate(scene, q0, v0, np.array([0.0, 50.0]), level)
+            run = lagjax.simulate(CORNER_AWAY_FROM_ZERO, q0, v0, np.array([0.0, 50.0]), level)
             np.testing.assert_allclose([run.q[-1] - level, run.qdot[-1]], 0.0, atol=1e-12)
 
 
@@ -405,6 +405,11 @@ PUCK = lagjax.System(
     lambda q, v: 0.5 * v @ v,
     forces=lambda q, v, t, params: params[0:2] + t * params[2:4] - params[4] * v / jnp.linalg.norm(v),
 )
+DISCS = lagjax.System(
+    lambda q, v: 0.5 * jnp.sum(v * v),
+    forces=lambda q, v: -2.0 * jnp.stack([f(v[i]) for i, f in enumerate(DIRECTIONS)] + [0.0 * v[-1]]),
+    dissipation=lambda q, v: 2.0 * jnp.linalg.norm(v[-1]),
+)
 
 
 def puck(v0, params, *ts):
@@ -413,13 +418,8 @@ def puck(v0, params, *ts):
 
 def test_discs_stop_and_rest_in_every_spelling():
     """Each disc stops after v/μ at v²/2μ, and stays there."""
-    scene = lagjax.System(
-        lambda q, v: 0.5 * jnp.sum(v * v),
-        forces=lambda q, v: -2.0 * jnp.stack([f(v[i]) for i, f in enumerate(DIRECTIONS)] + [0.0 * v[-1]]),
-        dissipation=lambda q, v: 2.0 * jnp.linalg.norm(v[-1]),
-    )
     v0 = np.array([[0.3, 0.4], [-0.6, 0.2], [0.1, 0.7], [0.5, -0.5], [0.4, 0.1], [0.2, 0.3]])
-    run = lagjax.simulate(scene, np.zeros((6, 2)), v0, np.array([0.0, 1.0, 1e6]))
+    run = lagjax.simulate(DISCS, np.zeros((6, 2)), v0, np.array([0.0, 1.0, 1e6]))
     exact = v0 * np.linalg.norm(v0, axis=1, keepdims=True) / 4
     np.testing.assert_allclose(run.q[1:], np.stack([exact, exact]), atol=1e-12)
     np.testing.assert_array_equal(run.qdot[1:], 0.0)

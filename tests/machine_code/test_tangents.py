@@ -15,6 +15,7 @@ from lagjax._native.motions import _kernel
 
 TOLERANCES = Tolerances(1e-10, 1e-13, 4096)
 TS = np.array([[0.0, 0.4, 0.5, 1.3, 2.0]])
+SIMPLE_ALONG_AN_AXIS = lagjax.System(lambda q, v: 0.5 * v @ v - q[1] ** 2 / (1.0 + 25.0 * q[0] ** 2))
 
 
 def swing(q, v, params):
@@ -96,11 +97,12 @@ def test_tangents_of_a_motion_at_rest():
 
 def test_tangents_across_a_motion_that_is_simpler_than_they_are():
     """Along the ridge y = 0 of V = y²/(1 + x²) nothing acts on the motion, and its steps could have any length."""
-    scene = lagjax.System(lambda q, v: 0.5 * v @ v - q[1] ** 2 / (1.0 + 25.0 * q[0] ** 2))
     ts = np.array([0.0, 3.0])
 
     def end(y):
-        return lagjax.simulate(scene, jnp.array([-1.5, y]), jnp.array([1.0, 0.0]), ts, rtol=1e-10).q[-1, 1]
+        return lagjax.simulate(SIMPLE_ALONG_AN_AXIS, jnp.array([-1.5, y]), jnp.array([1.0, 0.0]), ts, rtol=1e-10).q[
+            -1, 1
+        ]
 
     beside = (end(1e-4) - end(-1e-4)) / 2e-4  # of motions that need their steps; 1e-8 of a third derivative
     assert abs(beside) > 0.1

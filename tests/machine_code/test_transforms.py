@@ -18,6 +18,9 @@ from lagjax import scenes
 
 SPRING = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2 - 0.1 * params["c"] * q)
 PENDULUM = lagjax.System(lambda q, v: 0.5 * v**2 + 9.81 * jnp.cos(q))
+HUNDRED_STIFFNESSES = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * jnp.mean(params) * q**2)
+CIRCLE_G = lagjax.System(weight_g, constraints=lambda q: jnp.sum(q**2) - 1.0)
+CIRCLE = lagjax.System(weight, constraints=lambda q: q @ q - 1.0)
 X = np.array([1.0, 0.3, 2.3, 0.7, 0.1])  # q, q̇, k, c and the time of the start
 TIMES = np.array([0.4, 1.0, 2.1])
 MODES = {"forward": jax.jacfwd, "reverse": jax.jacrev}
@@ -85,8 +88,7 @@ def test_batches_of_second_derivatives_are_those_of_their_members():
 
 def test_a_hundred_parameters():
     # A row of springs side by side: only their sum is felt, so that every derivative is the same for each.
-    system = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * jnp.mean(params) * q**2)
-    value = lambda p: lagjax.simulate(system, 1.0, 0.0, jnp.array([0.0, 2.0]), p, rtol=1e-11).q[-1]
+    value = lambda p: lagjax.simulate(HUNDRED_STIFFNESSES, 1.0, 0.0, jnp.array([0.0, 2.0]), p, rtol=1e-11).q[-1]
     of_mean = lambda k: jnp.cos(2.0 * jnp.sqrt(k))
     p, direction = np.full(100, 1.7), np.sin(np.arange(100.0))
     np.testing.assert_allclose(jax.jit(jax.grad(value))(p), jax.grad(of_mean)(1.7) / 100, rtol=1e-9)
@@ -97,13 +99,12 @@ def test_a_hundred_parameters():
 @pytest.mark.slow
 def test_second_derivatives_on_a_constraint_are_those_of_the_angle():
     # By gravity and speed: a family of starts that stay on the circle.
-    circle = lagjax.System(weight_g, constraints=lambda q: jnp.sum(q**2) - 1.0)
     pendulum = PENDULUM_G
     ts = np.linspace(0, 1.5, 4)
 
     def on_circle(x):
         start = jnp.array([0.0, -1.0]), x[1] * jnp.array([1.0, 0.0])
-        return jnp.sum(lagjax.simulate(circle, *start, ts, x[0], rtol=1e-11).q ** 3)
+        return jnp.sum(lagjax.simulate(CIRCLE_G, *start, ts, x[0], rtol=1e-11).q ** 3)
 
     def by_angle(x):
         angle = lagjax.simulate(pendulum, 0.0, x[1], ts, x[0], rtol=1e-11).q
@@ -115,12 +116,11 @@ def test_second_derivatives_on_a_constraint_are_those_of_the_angle():
 
 @pytest.mark.slow
 def test_second_and_third_derivatives_by_a_start_that_moves_along_a_curved_constraint():
-    circle = lagjax.System(weight, constraints=lambda q: q @ q - 1.0)
     ts = np.array([0.0, 1.3, 2.0])
 
     def on_circle(angle):
         start = jnp.array([jnp.sin(angle), -jnp.cos(angle)])
-        return jnp.sum(lagjax.simulate(circle, start, jnp.zeros(2), ts, rtol=1e-11).q ** 3)
+        return jnp.sum(lagjax.simulate(CIRCLE, start, jnp.zeros(2), ts, rtol=1e-11).q ** 3)
 
     def by_angle(angle):
         angles = lagjax.simulate(PENDULUM, angle, 0.0, ts, rtol=1e-11).q

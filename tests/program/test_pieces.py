@@ -99,6 +99,7 @@ JUMPS = {
     "arccos of a cosine": (lambda u: jnp.arccos(jnp.cos(u)), lambda u: jnp.abs(WRAPPED(u))),
 }  # fmt: skip
 FAST_JUMPS = ("arctan2 of other lengths", "arctan at a pole", "copysign")
+REMOVABLE_POLE = lagjax.System(lambda q, v: 0.5 * v * v, forces=lambda q, v: jnp.arctan(jnp.sin(q) / q))
 
 
 @pytest.mark.parametrize("name", [pytest.param(x, marks=() if x in FAST_JUMPS else pytest.mark.slow) for x in JUMPS])
@@ -116,8 +117,7 @@ def test_jumps(name):
 
 def test_a_removable_pole_is_named():
     # 0/0 is no angle: the value is NaN where the user's is.
-    scene = lagjax.System(lambda q, v: 0.5 * v * v, forces=lambda q, v: jnp.arctan(jnp.sin(q) / q))
-    run = lagjax.simulate(scene, 0.0, 1.0, np.array([0.0, 1.0]), throw=False, solver=lagjax.MachineCode())
+    run = lagjax.simulate(REMOVABLE_POLE, 0.0, 1.0, np.array([0.0, 1.0]), throw=False, solver=lagjax.MachineCode())
     assert run.result == lagjax.RESULTS.nonfinite_state
 
 

@@ -193,6 +193,7 @@ FAMILIES = {
     ),
     "hessian": (jax.hessian(lambda a: jnp.prod(jnp.sin(a)) + jnp.sum(a) ** 3), A),
 }  # fmt: skip
+SIGN_OF_A_COMPLEX_NUMBER = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.real(jnp.sign(jnp.exp(0.7 + 1j * q))))
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -249,8 +250,7 @@ def test_derivatives_of_each_family(family):
 
 def test_derivatives_of_the_sign_of_a_complex_number():
     """z/|z| = e^(iθ): for L = v²/2 + Re z/|z| of z = e^(x + iq) the force is −sin q, whatever x is."""
-    scene = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.real(jnp.sign(jnp.exp(0.7 + 1j * q))))
-    derivation = derivation_of(scene, Layout.from_state(1.0, 0.0), None)
+    derivation = derivation_of(SIGN_OF_A_COMPLEX_NUMBER, Layout.from_state(1.0, 0.0), None)
     slope = derivation.evaluate(["lagrangian_by_q"], [np.array(1.0), np.array(0.0), 0.0])["lagrangian_by_q"]
     np.testing.assert_allclose(np.ravel(slope), -np.sin(1.0), rtol=1e-15)
 

@@ -47,6 +47,7 @@ def by_cholesky(q, v):
 
 Q, V = np.array([1.0, 1.5, 2.0, 0.1, 0.2, 0.3]), np.array([0.3, -0.2, 0.1, 0.4, -0.1, 0.2])
 TS = np.array([0.0, 0.5, 1.0])
+GEODESICS = lagjax.System(by_inverse)
 
 
 def geodesic(scale):
@@ -67,8 +68,7 @@ def test_geodesics_of_positive_matrices(lagrangian):
 
 @pytest.mark.slow
 def test_derivatives_of_geodesics():
-    system = lagjax.System(by_inverse)
-    end = lambda scale: lagjax.simulate(system, Q, scale * V, TS, rtol=1e-12).q[-1]
+    end = lambda scale: lagjax.simulate(GEODESICS, Q, scale * V, TS, rtol=1e-12).q[-1]
     np.testing.assert_allclose(jax.jacfwd(end)(1.0), jax.jacfwd(geodesic)(1.0), rtol=1e-9, atol=1e-10)
     np.testing.assert_allclose(jax.jacrev(end)(1.0), jax.jacfwd(geodesic)(1.0), rtol=1e-9, atol=1e-10)
     second = jax.jacfwd(jax.jacfwd(end))(1.0)

@@ -218,6 +218,8 @@ SINGULAR = {
 COUPLED = lagjax.System(lambda q, v: 0.5 * (v[0] + v[1]) ** 2 + 1e-9 * v[1] ** 2 - jnp.sum(q**2))
 STEP = lagjax.System(lambda q, v: 0.5 * v**2 - jnp.where(q > 1.25, 1.0, 0.0))
 SMOOTH = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * jnp.maximum(q - 1.25, 0.0) ** 2)
+TWO_COORDINATES = lagjax.System(lambda q, v: 0.5 * v["x"] ** 2 + 0.5 * v["angle"] ** 2)
+MANY_MISTAKES = lagjax.System(lambda q, v, t: -0.5 * v[0] ** 2, dissipation=lambda q, v: -(v[0] ** 2))
 
 
 @pytest.mark.parametrize("name", SINGULAR)
@@ -387,10 +389,11 @@ def test_numbers_that_are_given():
     whole = lagjax.check(lagjax.System(lambda q, v, params: params * v**2), 1.0, 0.0, params=2)
     assert only(whole).kind == "integer_parameter"
     assert not lagjax.check(FREE, 1e-9, 0.0).found  # the default atol is as small
-    two = lagjax.System(lambda q, v: 0.5 * v["x"] ** 2 + 0.5 * v["angle"] ** 2)
-    small = only(lagjax.check(two, {"x": 1e-9, "angle": 1.0}, {"x": 0.0, "angle": 0.0}))
+    small = only(lagjax.check(TWO_COORDINATES, {"x": 1e-9, "angle": 1.0}, {"x": 0.0, "angle": 0.0}))
     assert small.where == ("q['x']",) and "pass atol=1e-21" in small.message
-    assert not lagjax.check(two, {"x": 1e-17, "angle": 1.0}, {"x": 0.0, "angle": 0.0}).found  # rounding, of zero
+    assert not lagjax.check(
+        TWO_COORDINATES, {"x": 1e-17, "angle": 1.0}, {"x": 0.0, "angle": 0.0}
+    ).found  # rounding, of zero
     assert kinds(free, np.float32(1.0), np.float32(0.0)) == {"single_precision"}
 
 
@@ -414,8 +417,7 @@ def test_refused():
 
 
 def test_findings_are_frozen_sorted_and_fit_a_screen():
-    many = lagjax.System(lambda q, v, t: -0.5 * v[0] ** 2, dissipation=lambda q, v: -(v[0] ** 2))
-    findings = lagjax.check(many, np.ones(40), np.ones(40))
+    findings = lagjax.check(MANY_MISTAKES, np.ones(40), np.ones(40))
     levels = [finding.level for finding in findings]
     assert levels == sorted(levels, key=["error", "warning", "advice"].index) and len(set(levels)) == 3
     text = str(findings)

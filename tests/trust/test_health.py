@@ -51,6 +51,23 @@ CARRIED = lagjax.System(
     velocity_constraints=lambda q, v, t: v[0] - jnp.sin(t),
 )  # fmt: skip
 FALL = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2 - jnp.log(2.0 - q) * params["c"])
+DRIVEN_AND_BRAKED = lagjax.System(
+    lambda q, v, t: 0.5 * v**2 - 0.5 * 4.0 * q**2 + 0.3 * q * jnp.cos(0.5 * t),
+    forces=lambda q, v, t: 0.2 * jnp.cos(0.5 * t),
+    dissipation=lambda q, v: 0.5 * 0.3 * v**2,
+)
+FAST_DRIVEN = lagjax.System(
+    lagrangians.oscillator,
+    forces=lambda q, v, t: jnp.sin(7 * t),
+    dissipation=lambda q, v: 0.05 * v**2,
+)
+MOVING_ROD = lagjax.System(
+    lagrangians.weight,
+    constraints=lambda q, t: q[0] ** 2 + q[1] ** 2 - (1 + 0.1 * jnp.sin(t)) ** 2,
+    dissipation=lambda q, v: 0.05 * v[0] ** 2,
+)
+BRAKED_BALL = lagjax.System(lagrangians.ball, dissipation=lambda q, v: 0.1 * v**2)
+RAIL = lagjax.System(lagrangians.weight, constraints=lambda q: {"rail": q @ q - 1.0})
 
 
 @pytest.mark.parametrize("make", sweep(SCENES, KINDS), ids=lambda make: make.__name__)
@@ -89,22 +106,17 @@ def test_a_drift_beyond_the_tolerances_is_found():
 
 def test_power_balance_with_friction_and_a_driving_force():
     # x″ = −2γ x′ − ω² x + cos t/2 by forces, dissipation and an explicit time at once.
-    driven = lagjax.System(
-        lambda q, v, t: 0.5 * v**2 - 0.5 * 4.0 * q**2 + 0.3 * q * jnp.cos(0.5 * t),
-        forces=lambda q, v, t: 0.2 * jnp.cos(0.5 * t),
-        dissipation=lambda q, v: 0.5 * 0.3 * v**2,
-    )
-    trajectory = lagjax.simulate(driven, 1.0, 0.0, TS)
+    trajectory = lagjax.simulate(DRIVEN_AND_BRAKED, 1.0, 0.0, TS)
     health = trajectory.health()
     lost = np.ptp(np.asarray(trajectory.energy()))
     assert health.works and lost > 0.5
     # A quintic is off by h⁶ q⁽⁶⁾/46080 at most: steps of 1/4, and frequencies up to 4 of the power.
     assert health.energy.value < health.work_error < 4e-4 * lost
     assert flagged(health) == set()
-    finer = lagjax.simulate(driven, 1.0, 0.0, np.linspace(0.0, 10.0, 401)).health()
+    finer = lagjax.simulate(DRIVEN_AND_BRAKED, 1.0, 0.0, np.linspace(0.0, 10.0, 401)).health()
     assert finer.work_error < 1e-5 * health.work_error and flagged(finer) == set()
     assert finer.energy.value < finer.energy_allowed + finer.work_error
-    L, forces = driven.lagrangian.code.function, driven.forces.code.function
+    L, forces = DRIVEN_AND_BRAKED.lagrangian.code.function, DRIVEN_AND_BRAKED.forces.code.function
     forgotten = dataclasses.replace(trajectory, system=lagjax.System(L, forces=forces))
     assert flagged(forgotten.health()) == {"energy"}
 
@@ -143,12 +155,7 @@ def test_coarse_outputs_cry_no_wolf_and_hide_no_wrong_force():
 
 def test_a_power_balance_that_so_few_outputs_cannot_tell():
     # Three outputs in twenty periods of a force that pumps and drains: the work between them is anybody's guess.
-    driven = lagjax.System(
-        lagrangians.oscillator,
-        forces=lambda q, v, t: jnp.sin(7 * t),
-        dissipation=lambda q, v: 0.05 * v**2,
-    )
-    few, more = (lagjax.simulate(driven, 1.0, 0.0, np.linspace(0.0, 20.0, T)).health() for T in (3, 81))
+    few, more = (lagjax.simulate(FAST_DRIVEN, 1.0, 0.0, np.linspace(0.0, 20.0, T)).health() for T in (3, 81))
     assert few.energy.value > 1e3 * few.energy_allowed and flagged(few) == set()
     (sentence,) = few.findings()
     assert "cannot be told from 3 outputs" in sentence and f"about {few.outputs_needed:.0f} outputs" in sentence
@@ -359,17 +366,13 @@ def test_batch_vmap_and_jit_agree():
 @pytest.mark.slow
 def test_numbers_and_traced_values_are_measured_alike():
     # By programs in NumPy, and in JAX: with constraints, forces, a conserved momentum, and modes.
-    held = lagjax.System(
-        lagrangians.weight,
-        constraints=lambda q, t: q[0] ** 2 + q[1] ** 2 - (1 + 0.1 * jnp.sin(t)) ** 2,
-        dissipation=lambda q, v: 0.05 * v[0] ** 2,
-    )
     start = np.array([1.0, 0.0, 0.3]), np.array([0.1, 0.0, 1.0])
-    ball = lagjax.System(lagrangians.ball, dissipation=lambda q, v: 0.1 * v**2)
     bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.8 * v))
     for run in (
-        lagjax.simulate(held, *start, np.linspace(0.0, 2.0, 21)),
-        lagjax.simulate(lagjax.Hybrid({"flight": ball}, [bounce], "flight"), 1.0, 0.0, np.linspace(0.0, 1.5, 31)),
+        lagjax.simulate(MOVING_ROD, *start, np.linspace(0.0, 2.0, 21)),
+        lagjax.simulate(
+            lagjax.Hybrid({"flight": BRAKED_BALL}, [bounce], "flight"), 1.0, 0.0, np.linspace(0.0, 1.5, 31)
+        ),
     ):
         eager, traced = run.health(), jax.jit(lambda run: run.health())(run)
         assert eager.works and (eager.work_error > 0).all() and flagged(eager) == set()
@@ -422,10 +425,9 @@ def test_energy_between_bounces():
 @pytest.mark.slow
 def test_constraints_of_one_mode_and_not_of_another():
     # Down the inside of a circle to its lowest place, then straight on.
-    held = lagjax.System(lagrangians.weight, constraints=lambda q: {"rail": q @ q - 1.0})
     free = WEIGHT
     off = lagjax.Transition("rail", "air", lambda q, v: q[0])
-    modes, start = {"rail": held, "air": free}, (np.array([-1.0, 0.0]), np.zeros(2))
+    modes, start = {"rail": RAIL, "air": free}, (np.array([-1.0, 0.0]), np.zeros(2))
     fallen = lagjax.simulate(lagjax.Hybrid(modes, [off], "rail"), *start, np.linspace(0.0, 1.0, 21))
     health = fallen.health()
     assert np.unique(fallen.mode).tolist() == [0, 1] and flagged(health) == set()

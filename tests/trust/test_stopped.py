@@ -41,6 +41,10 @@ BLOCK = lagjax.System(
     lambda q, v: 0.5 * v @ v - 9.0 * q[1], contacts=lambda q: {"floor": q[1]},
     forces=lambda q, v, multipliers: jnp.array([0.0, -multipliers["floor"] ** 2]),
 )  # fmt: skip
+FORCE_THAT_ENDS = lagjax.System(
+    lambda q, v: 0.5 * v["x"] ** 2 + 0.5 * v["y"] ** 2,
+    forces=lambda q, v, t: {"x": 0.0, "y": jnp.sqrt(0.5 - t)},
+)
 
 
 def names(result):
@@ -68,13 +72,9 @@ def test_members_are_named_under_transformations():
 
 
 def test_the_message_names_the_time_and_the_force_that_ends():
-    scene = lagjax.System(
-        lambda q, v: 0.5 * v["x"] ** 2 + 0.5 * v["y"] ** 2,
-        forces=lambda q, v, t: {"x": 0.0, "y": jnp.sqrt(0.5 - t)},
-    )
     q0 = {"x": 1.0, "y": 0.0}
     with pytest.raises(lagjax.SimulationError, match=r"beyond t = 0.5 of(.|\n)*ahead: the force on q\['y'\] \(nan\), "):
-        lagjax.simulate(scene, q0, q0, TS)
+        lagjax.simulate(FORCE_THAT_ENDS, q0, q0, TS)
 
 
 def kinetic(q, qdot):

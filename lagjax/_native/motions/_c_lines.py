@@ -17,9 +17,10 @@ from lagjax._native.code._constants import LARGEST_ANGLE
 from lagjax._native.series._lanes import COS, PI_2, PI_2_ROUNDED, SIN
 from lagjax._program import LOOK_UPS, OPERATIONS, StraightLine, Unlowerable, count_uses, table_of
 
-# Statements of one function. With gcc 12 -O2 a chain of 32 pendulums compiles for 4.8 CPU s, with a third of this for
-# 3.4; an arm of seven joints, whose acceleration is one function here, takes 0.94 µs.
-LONGEST_IN_C = 1000
+# Statements of one function. With gcc 12 -O2 a chain of 32 pendulums compiles for 3.4 CPU s, with three times as many
+# for 4.8; an arm of seven joints for 1.1, and its acceleration takes 0.88 µs, with three times as many 0.92.
+LONGEST_IN_C = 300
+MOST_ZEROS = 16  # outputs that are zero and written one by one
 LARGEST_EXPRESSION = 16  # operands of an expression that stands where it is used; a larger one has a name
 
 # Types of whole numbers, and what is done with these. Accelerations have few: steps that are counted, and indices.
@@ -170,7 +171,7 @@ class _Parts:
             self.bodies.append("".join(f"    {statement}\n" for statement in self.text))
 
     def _find_inlined(self) -> list[bool]:
-        """Whether each node stands where it is used: constants, and arithmetic of one use."""
+        """Flags of the nodes that stand where they are used: constants, and arithmetic of one use."""
         nodes, size = self.line.nodes, [1] * len(self.line.nodes)
         inlined, repeated = [False] * len(nodes), set(self.line.outputs)
         for op, operands, _ in nodes:
@@ -203,7 +204,10 @@ class _Parts:
             places.setdefault(i, []).append(k)
         if not self.here:
             constants = [i for i in places if self.line.nodes[i][0] == "constant"]
-            self.text += [f"out[{k}] = {self._refer(i)};" for i in constants for k in places[i]]
+            zero = self.numbers.constant(0.0)
+            zeros = [i for i in constants if len(places[i]) > MOST_ZEROS and self._refer(i) == zero]
+            self.text += [f"for (long i = 0; i < {len(self.line.outputs)}; i++) out[i] = 0;" for _ in zeros]
+            self.text += [f"out[{k}] = {self._refer(i)};" for i in constants if i not in zeros for k in places[i]]
         for i in named:
             self._write_statement(i)
             self.text += [f"out[{k}] = v{i};" for k in places.get(i, ())]

@@ -56,7 +56,7 @@ class LineCode:
         room = len(common.outputs) if common else 1 if write is None else 2 ** math.ceil(math.log2(2 * write.size))
         code, sincos = (
             Code(module, "evaluate", LINE_ARGUMENTS, lanes, public=True, rounds=True),
-            _sincos_of(module, rest, lanes),
+            _sincos_of(module, rest, lanes, "rows"),
         )
         (x, out, rows, given, times), room = code.arguments, code.stack(max(1, room))
         with code.loop(times) as time:
@@ -150,14 +150,14 @@ def _split_line(
     return eliminate_dead_code(renumber({}, {i: k for k, i in enumerate(shared)}), kept), rest
 
 
-def _sincos_of(module: ir.Module, line: StraightLine, lanes: int) -> Code | None:
+def _sincos_of(module: ir.Module, line: StraightLine, lanes: int, name: str) -> Code | None:
     turns = any(op in ("sin", "cos") for op, _, _ in line.nodes)
-    return sincos_function(module, lanes, f"sincos{lanes}", rounds=True) if turns else None
+    return sincos_function(module, lanes, f"sincos_{name}", rounds=True) if turns else None
 
 
 def _write_common(module: ir.Module, line: StraightLine, inputs: int) -> Code:
     """The function (inputs, outputs) of a line."""
-    code, sincos = Code(module, "common", [POINTER, POINTER], 1, rounds=True), _sincos_of(module, line, 1)
+    code, sincos = Code(module, "common", [POINTER, POINTER], 1, rounds=True), _sincos_of(module, line, 1, "common")
     given, out = code.arguments
     if compilation_work(line, 1) > WORK_OPTIMISED:
         for attribute in ("noinline", "optnone"):

@@ -59,18 +59,15 @@ def follow_contacts(given: Problem, problem: Problem, max_transitions: int | Non
     if has_constraints(problem.system):
         q0, qdot0 = map(problem.layout.restore, halves(jnp.asarray(problem.y0)))
         require_consistent(problem.system, problem.layout, problem.ts, q0, qdot0, problem.params)
-    follow = _follow_at_once if problem.is_known else _follow_compiled
-    found = follow(plan, problem)
+    found = _put_on_device(_follow(plan, problem)) if problem.is_known else _follow_compiled(plan, problem)
     return dataclasses.replace(found, ts=jnp.asarray(given.ts), system=given.system, params=given.params)
 
 
-def _follow_at_once(plan: ContactPlan, problem: Problem) -> Trajectory:
-    return _put_on_device(_trajectory(problem, problem, *_motion(plan, problem), None, plan.max_transitions))
+def _follow(plan: ContactPlan, problem: Problem) -> Trajectory:
+    return _trajectory(problem, problem, *_motion(plan, problem), None, plan.max_transitions)
 
 
-@compile_for_one_call  # outside of `jit` one program, and not one an operation
-def _follow_compiled(plan: ContactPlan, problem: Problem) -> Trajectory:
-    return _trajectory(problem, problem, *_motion(plan, problem), problem.params, plan.max_transitions)
+_follow_compiled = compile_for_one_call(_follow)  # outside of `jit` one program, and not one an operation
 
 
 def _put_on_device(trajectory: Trajectory) -> Trajectory:

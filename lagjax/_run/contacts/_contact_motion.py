@@ -12,14 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._engine.taylor import (
-    Surfaces,
-    Tolerances,
-    line_of,
-    make_flow,
-    require_one_number,
-    vector_of,
-)
+from lagjax._engine.taylor import Surfaces, Tolerances, line_of, make_flow, require_one_number, vector_of
 from lagjax._equations import Derivation, derivation_of, forms
 from lagjax._interface import Function, Layout, compile_for_one_call, halves
 from lagjax._program import Unlowerable

@@ -25,13 +25,7 @@ what a `row` of the record says; they are declared in `_places`. A flag is 0 or 
 from math import isfinite, sqrt
 
 from lagjax._interface import RESULTS, SUCCESSFUL, code_of
-from lagjax._native import (
-    GUARD_NOISE,
-    SMALLEST_STEP,
-    Floats,
-    evaluate,
-    loop,
-)
+from lagjax._native import GUARD_NOISE, SMALLEST_STEP, Floats, evaluate, loop
 from lagjax._run.contacts._law import (
     EPS,
     LINKED,

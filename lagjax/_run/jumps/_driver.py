@@ -136,11 +136,10 @@ def follow_stretch(
     y_end, t_end = found[count * outputs * states :], found[count * (outputs + 1) * states :]
     code, steps, rejected, fell = t_end[count:], t_end[2 * count :], t_end[3 * count :], t_end[4 * count :]
     left = fell[count * scene.counts[mode] :]
-    which = 2 * mode + (0 if count == 1 else 1)
-    plan, rest = scene.plans[which], scene.rests[which]
+    plan = scene.plans[2 * mode + (0 if count == 1 else 1)]
     for i in range(count):
         m = int(places[i])
-        mine = memory[m * size :]
+        mine, code[i] = memory[m * size :], -1.0  # until it has ended
         if plan != 0:
             prepare(
                 scene, mine, ts[m * scene.stride :], job[i * outputs :], given_y[i * states :],
@@ -154,14 +153,13 @@ def follow_stretch(
         scene.begin, plan, job, given_y, given_numbers, found, y_end, t_end, code, steps, rejected, fell, left, count,
         outputs
     )  # fmt: skip
-    undone = left[rest - 1] != 0
     for i in range(count):
         m = int(places[i])
         mine, result = memory[m * size :], int(code[i])
         sound = result == SUCCESSFUL or result == EVENT
         for j in range(states):
             sound = sound and isfinite(y_end[i * states + j])
-        if undone or not sound:
+        if not sound:
             mine.result = float(ASKS)
         else:
             finish(

@@ -27,8 +27,8 @@ SIZES = (
 ARRAYS = (
     "COUNTS",  # (modes,), the watches of each
     # Addresses of machine code, 0 where there is none yet, of each mode: plans of its kernel for one and many members,
-    # doubles of what this leaves behind, of which the last says whether a run is done; its watches.
-    "PLANS", "RESTS", "WATCH", "ERRORS", "SLOPES",
+    # and its watches.
+    "PLANS", "WATCH", "ERRORS", "SLOPES",
 )  # fmt: skip
 # Each field with the count of its doubles, by the sizes; "" is one number.
 MEMORY = {

@@ -93,8 +93,8 @@ class SceneCode:
         self.law, self.modes, self.lines, self.tolerances, self._first = law, modes, lines, tolerances, first
         counts = np.array([mode.count for mode in modes])
         self.sizes = sizes | {"MODES": len(modes), "WATCHES": int(counts.max())}
-        empty = dict.fromkeys(("WATCH", "ERRORS", "SLOPES"), np.zeros(len(modes)))
-        empty |= dict.fromkeys(("PLANS", "RESTS"), np.zeros(2 * len(modes)))
+        empty: dict = dict.fromkeys(("WATCH", "ERRORS", "SLOPES"), np.zeros(len(modes)))
+        empty["PLANS"] = np.zeros(2 * len(modes))
         self.arrays, self.fields = {"COUNTS": counts, **empty, **arrays}, law.places.count_doubles(self.sizes)
         self._keep = []  # what the addresses point to
         self.flow_of = functools.cache(lambda mode: modes[mode].make())
@@ -137,7 +137,6 @@ class SceneCode:
             plan = type(plan)(*(_ROUNDS if field == "rounds" else getattr(plan, field) for field, *_ in plan._fields_))
             self._keep.append((plan, kernel))
             scene[scene[at.PLANS] + 2 * mode + wide] = ctypes.addressof(plan)
-            scene[scene[at.RESTS] + 2 * mode + wide] = kernel.rest_size
             scene[at.REST] = max(scene[at.REST], kernel.rest_size)
 
     def _add_codes(self, scene: np.ndarray, lines: dict[Any, Line]) -> None:
@@ -292,15 +291,8 @@ class _Run:
         given = scene, memory, ts, *of_member, np.ascontiguousarray(done.path[0]), np.ascontiguousarray(done.y_end[0])
         result, fell = SUCCESSFUL if happened else int(done.result[0]), done.event[0].astype(float)
         steps = float(done.accepted[0]), float(done.rejected[0])
-        loops[2](
-            *(x.ctypes.data for x in given),
-            float(done.t_end[0]),
-            fell.ctypes.data,
-            int(happened),
-            result,
-            *steps,
-            work.ctypes.data,
-        )
+        addresses = [x.ctypes.data for x in given]
+        loops[2](*addresses, float(done.t_end[0]), fell.ctypes.data, int(happened), result, *steps, work.ctypes.data)
 
 
 # ---- as a primitive --------------------------------------------------------------------------------------------------

@@ -106,11 +106,14 @@ class CheckedScene(NamedTuple):
 
     def line(self, direction: np.ndarray, steps: np.ndarray) -> "LineValues":
         """The scene along a `direction` (2n + 1,) of the coordinates, the velocities and the time of the motion."""
-        q, qdot, t, params = self.arguments
-        n, here = self.layout.size, self.point
+        n, m, here = self.layout.size, self.measured, self.point
         moved = direction + direction[-1] * np.concatenate([here[n:-1], np.zeros(n + 1)])
-        values = _evaluate_line(self.system, q, qdot, t, params, moved.astype(here.dtype), steps)
-        return LineValues(*(np.asarray(x, float) for x in values))
+        q, qdot, t, params = self.arguments
+        line = LineValues(*_evaluate_line(self.system, q, qdot, t, params, moved.astype(here.dtype), steps))
+        far, fast = np.abs(here[:n]), np.abs(here[n:-1])
+        of_l = far @ np.abs(m.by_q) + fast @ np.abs(m.momentum[0])
+        terms = line.terms + np.array([of_l, 0.0, fast @ np.abs(m.by_v_of_dissipation), 0.0, 0.0])
+        return LineValues(*(np.asarray(x, float) for x in line._replace(terms=terms)))
 
     @property
     def lagrangian(self) -> np.ndarray:
@@ -146,13 +149,11 @@ class CheckedScene(NamedTuple):
         return x[:n], x[n:]
 
     def jacobian(self) -> np.ndarray:
-        """∂q̈/∂(q, q̇) at the state, (n, 2n), by the implicit function theorem."""
-        acceleration, multipliers = self.solve_saddle()
+        """∂q̈/∂(q, q̇) at the state, (n, 2n): by the implicit function theorem and programs, or compiled by XLA."""
         try:
-            varied = _program_variation(self.derivation, self.state, acceleration, multipliers)
+            varied = _program_variation(self.derivation, self.state, *self.solve_saddle())
         except Unlowerable:
-            q, qdot, t, params = self.arguments
-            varied = np.asarray(_variation(self.system, q, qdot, t, params, acceleration, multipliers))
+            return np.concatenate(_acceleration_slopes(self.system, *self.arguments), axis=1)
         return self._solve(-varied)[: self.layout.size]
 
     def _solve(self, b: np.ndarray) -> np.ndarray:
@@ -274,36 +275,24 @@ def _evaluate_line(system: System, q, qdot, t, params, direction, steps):
     layout = Layout.from_state(q, qdot)
     motion, n = derivation_of(system, layout, params).motion, layout.size
     numbers, along = eqx.filter(params, eqx.is_array_like), (direction[:n], direction[n:-1], direction[-1])
-    state = layout.flatten(q), layout.flatten(qdot), t
-
-    def weighted(x):  # no symmetry makes terms cancel
-        return jnp.sum(x * (weights := jnp.cos(jnp.arange(1.0, x.size + 1)))), jnp.sum(jnp.abs(x * weights))
-
-    def values(q, v, t):
-        momentum, constraints = motion.momentum(q, v, t, numbers), motion.constraints
-        return list(map(weighted, (momentum, constraints.f(q, t, numbers), constraints.a(q, v, t, numbers))))
+    state, constraints = (layout.flatten(q), layout.flatten(qdot), t), motion.constraints
 
     def dissipation(*state):
-        return jnp.zeros((), q0.dtype) if motion.dissipation is None else motion.dissipation(*state, numbers)
+        return jnp.zeros_like(direction[0]) if motion.dissipation is None else motion.dissipation(*state, numbers)
 
-    def outputs(*state):
-        p, f, a = (value for value, _ in values(*state))
-        return jnp.stack([motion.lagrangian(*state, numbers), p, dissipation(*state), f, a])
-
-    q0, v0, _ = state
-    slopes = jax.grad(motion.lagrangian, argnums=(0, 1, 2))(*state, numbers)
-    drag = jax.grad(dissipation, argnums=1)(*state)
-    p, f, a = jax.jvp(lambda *state: [value for value, _ in values(*state)], state, along)[1]
-    derivative = jnp.stack([sum(jnp.sum(x * d) for x, d in zip(slopes, along, strict=True)), p, drag @ along[1], f, a])
-    here = outputs(*state)
-    of_p, of_f, of_a = (terms for _, terms in values(*state))
-    of_l = jnp.abs(here[0]) + jnp.sum(jnp.abs(q0 * slopes[0])) + jnp.sum(jnp.abs(v0 * slopes[1]))
-    terms = jnp.stack([of_l, of_p, jnp.abs(here[2]) + jnp.sum(jnp.abs(v0 * drag)), of_f, of_a])
+    def outputs(q, v, t, size=lambda x: x):
+        of_l, p = (function(q, v, t, numbers) for function in (motion.lagrangian, motion.momentum))
+        parts = of_l, p, dissipation(q, v, t), constraints.f(q, t, numbers), constraints.a(q, v, t, numbers)
+        weighted = [jnp.ravel(x) * jnp.cos(jnp.arange(1.0 * jnp.size(x))) for x in parts]  # which nothing cancels
+        return jnp.stack([jnp.sum(size(x)) for x in weighted])
 
     def moved(step):
         return outputs(*(x + step * d for x, d in zip(state, along, strict=True)))
 
-    return here, terms, derivative, jax.lax.map(moved, -steps), jax.lax.map(moved, steps)
+    here, derivative = jax.jvp(outputs, state, along)
+    of_d = jax.jvp(lambda v: dissipation(state[0], v, t), (state[1],), (along[1],))[1]
+    sides = (jax.lax.map(moved, sign * steps) for sign in (-1, 1))
+    return here, outputs(*state, size=jnp.abs), derivative.at[2].set(of_d), *sides
 
 
 def _program_variation(derivation: Derivation, state, acceleration, multipliers) -> np.ndarray:
@@ -333,16 +322,8 @@ def _rounding(*terms):
 
 
 @eqx.filter_jit
-def _variation(system: System, q, qdot, t, params, acceleration, multipliers):
-    """The slopes of M q̈ − Gᵀλ − F and G q̈ − γ by (q, q̇), (n + m, 2n), for constant q̈ and λ: compiled by XLA."""
-    layout = Layout.from_state(q, qdot)
-    motion, numbers = system._motion(layout, params), eqx.filter(params, eqx.is_array_like)
-
-    def balance(y):
-        q, qdot = jnp.split(y, 2)
-        matrix, force = motion.mass_matrix_and_force(q, qdot, t, numbers)
-        jacobian, gamma = (of(q, qdot, t, numbers) for of in (motion.constraints.jacobian, motion.constraints.gamma))
-        left = matrix @ acceleration - jacobian.T @ multipliers - force
-        return jnp.concatenate([left, jacobian @ acceleration - gamma])
-
-    return jax.jacfwd(balance)(jnp.concatenate([layout.flatten(q), layout.flatten(qdot)]))
+def _acceleration_slopes(system: System, q, qdot, t, params):
+    """∂q̈/∂q and ∂q̈/∂q̇, (n, n) each."""
+    layout, numbers = Layout.from_state(q, qdot), eqx.filter(params, eqx.is_array_like)
+    state = layout.flatten(q), layout.flatten(qdot), t, numbers
+    return jax.jacfwd(system._motion(layout, params).acceleration, argnums=(0, 1))(*state)
