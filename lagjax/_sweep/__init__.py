@@ -154,7 +154,7 @@ class Sweep:
 def sweep(
     system: Scene,
     over: dict,
-    ts: jax.Array,
+    ts: jax.Array | Callable,
     *,
     q0: PyTree,
     qdot0: PyTree,
@@ -181,7 +181,8 @@ def sweep(
     - `over`: a dict of axes, of which the product is swept. A 1-D array is an axis by its name; a design of
       `lagjax.designs` (`random`, `sobol`, `latin_hypercube`) draws its values by a rule; a tuple of names with a tuple
       of arrays, or with a design, varies several together. There may be 10⁸ members: they are never listed.
-    - `ts`: output times, shape (T,), of every member.
+    - `ts`: output times, shape (T,), of all members, or a function of one member's point that returns those of this
+      member, as many for each: `ts=lambda point: point["period"] * np.linspace(0.0, 10.0, 101)`.
     - `q0`, `qdot0`, `params`: values for all, or functions of one member's point, which is a dict of numbers by the
       names in `over`.
 
@@ -257,7 +258,13 @@ def sweep(
     if not isinstance(reduce, dict) or not all(isinstance(how, Statistics) for how in reduce.values()):
         raise TypeError("reduce must be a dict of lagjax.Statistics by the names that keep returns.")
     sections = Sections.from_arguments(settled.crossings, keep, settings)
-    description = Description(system, _times(ts), q0, qdot0, params, keep, reduce, settings, sections)
+    if callable(ts) and (sections is not None or settled.extend is not None):
+        raise ValueError(
+            f"{'extend' if sections is None else 'crossings'} of sweep: for members that share their times. Give ts as "
+            "an array."
+        )
+    times = ts if callable(ts) else np.asarray(output_times(ts, float))
+    description = Description(system, times, q0, qdot0, params, keep, reduce, settings, sections)
     if executor is not None:
         require_executor(executor)
     axes, part = axes_of(over), require_part(settled.part)
@@ -282,12 +289,3 @@ def _folder(path: Any, name: str) -> Files:
     if not isinstance(path, str | os.PathLike) or not str(path):
         raise TypeError(f"{name} must be the name of a folder, such as 'map.zarr'; got {path!r}.")
     return Files(Path(path).expanduser().absolute())
-
-
-def _times(ts) -> np.ndarray:
-    if callable(ts):
-        raise TypeError(
-            "ts must be an array of output times, which all members share; got a function. For ends of their own take "
-            "the latest of all, and end each one by event=lambda q, qdot, t, params: t - params[...]."
-        )
-    return np.asarray(output_times(ts, float))

@@ -66,34 +66,42 @@ class Batches:
         self.description, self.conserves = description, conserves
         self.quantities: list[Quantity] = []  # what is kept of each member, once that is known
         self.slow: dict[str, str] = {}  # which functions are called member by member, and why
-        roles = {role: getattr(description, role) for role in ("q0", "qdot0", "params")}
+        roles = {role: getattr(description, role) for role in ("q0", "qdot0", "params", "ts")}
         if names := description.starts:
             roles["q0"] = lambda point: jax.tree.map(point.__getitem__, names.q)
             roles["qdot0"] = lambda point: jax.tree.map(point.__getitem__, names.qdot)
         if not any(map(callable, roles.values())):
             raise ValueError(
-                "None of q0, qdot0 and params is a function: all members would be the same. Write q0=lambda point: "
+                "None of q0, qdot0, params and ts is a function: all members would be the same. Write q0=lambda point: "
                 "point['theta'], with the names of `over`."
             )
+        if callable(roles["ts"]) and not callable(roles["q0"]):
+            roles["q0"] = lambda _: description.q0  # each member has a start, as it has times
         self._starts = {role: self._map_start(role, f) if callable(f) else None for role, f in roles.items()}
-        self._axes = tuple(0 if start else None for start in self._starts.values())
+        self._axes = tuple(0 if self._starts[role] else None for role in ("q0", "qdot0", "params"))
         self._keep_all, self._keep_one = jax.jit(self._keep_vectorized), jax.jit(self._keep_member)
         self._drift_all, self._tolerances = jax.jit(jax.vmap(self._drift_of, in_axes=(0, self._axes[2]))), None
         self._settings = None
 
     def __call__(self, points: dict[str, np.ndarray]) -> KeptResults:
         """The kept values of the members at these points (B,)."""
-        motions, no_start = self._compute_motions(points)
+        motions, no_start, wrong = self._compute_motions(points)
         kept, drift, complaints = self._keep_results(motions)
+        complaints |= wrong
         result = np.asarray(motions.run.result._value).astype(RESULT.dtype)
         if complaints:
             result = result.copy()
             result[list(complaints)] = KEEP_FAILED
+        if wrong:
+            expected = self.quantities or [Quantity(name, x.shape[1:], x.dtype) for name, x in kept.items()]
+            kept = {name: np.array(x) for name, x in kept.items()}
+            for q in expected:
+                kept[q.name][list(wrong)] = q.filling
         return KeptResults(kept, result, drift, no_start | complaints, motions.run.engine)
 
     def count_member_bytes(self, points: dict[str, np.ndarray]) -> int:
         """The bytes that are kept of a member, of the first of these; 0 where `keep` fails for that one."""
-        motions, _ = self._compute_motions({name: x[:1] for name, x in points.items()})
+        motions, *_ = self._compute_motions({name: x[:1] for name, x in points.items()})
         try:
             kept, _ = jax.eval_shape(self._keep_vectorized, motions.arrays, motions.params)
             return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(kept))
@@ -101,14 +109,19 @@ class Batches:
             (row,), _ = self._rows(motions)
             return sum(x.nbytes for x in (row or {}).values())
 
-    def _compute_motions(self, points: dict[str, np.ndarray]) -> tuple["_BatchMotions", dict[int, str]]:
-        description, ts, complaints = self.description, jnp.asarray(self.description.ts), {}
+    def _compute_motions(self, points: dict[str, np.ndarray]) -> tuple["_BatchMotions", dict[int, str], dict[int, str]]:
+        """The motions, and complaints by members: about their starts, and about times that are none."""
+        description, complaints, wrong = self.description, {}, {}
         starts = self._starts.items()
         values = {role: f(points, complaints) if f else getattr(description, role) for role, f in starts}
-        run, crossings = run_batch(description, values, ts, self._axes)
+        ts = values.pop("ts")
+        if self._starts["ts"]:
+            ts, wrong = _sound_times(ts, complaints)
+        run, crossings = run_batch(description, values, jnp.asarray(ts), self._axes)
         self._tolerances, self._settings = None if jumps(description.system) else run.tolerances, run.settings
         for_members = values["params"] if self._axes[2] == 0 else None
-        return _BatchMotions(run, (_arrays(run), crossings), for_members), complaints
+        of_run = _arrays(run) | ({"ts": ts} if self._starts["ts"] else {})
+        return _BatchMotions(run, (of_run, crossings), for_members), complaints, wrong
 
     def _keep_results(self, motions: "_BatchMotions") -> _Kept:
         """The result of `keep` for each member, the change of its energy, and the members for which `keep` raised."""
@@ -155,11 +168,11 @@ class Batches:
         return kept
 
     def _trajectory(self, arrays: dict, params: PyTree) -> Trajectory:
-        scene, code = self.description.system, arrays["code"]
+        scene, code, ts = self.description.system, arrays["code"], arrays.get("ts", self.description.ts)
         modes = dict(scene.modes) if isinstance(scene, Hybrid) else None
         return Trajectory.from_fields(
-            **{name: x for name, x in arrays.items() if name != "code"}, result=result_from(code),
-            settings=self._settings, tolerances=self._tolerances, ts=jnp.asarray(self.description.ts),
+            **{name: x for name, x in arrays.items() if name not in ("code", "ts")}, result=result_from(code),
+            settings=self._settings, tolerances=self._tolerances, ts=jnp.asarray(ts),
             system=modes or scene,
             params=self.description.params if self._axes[2] is None else params, mode_names=tuple(modes or ()),
             contact_names=(),
@@ -209,6 +222,16 @@ class _BatchMotions(NamedTuple):
     run: Trajectory
     arrays: tuple
     params: PyTree
+
+
+def _sound_times(ts: np.ndarray, complaints: dict[int, str]) -> tuple[np.ndarray, dict[int, str]]:
+    """Times (B, T), in place of those that cannot be followed any others; and what is wrong with these, by members."""
+    steps = np.diff(ts, axis=1)
+    is_sound: Any = np.isfinite(ts).all(axis=1) & ((steps > 0).all(axis=1) | (steps < 0).all(axis=1))
+    reason = "ts returned times that are not finite, or neither increase nor decrease"
+    wrong = {k: complaints.pop(k, reason) for k in np.flatnonzero(~is_sound).tolist()}
+    any_times = ts[np.argmax(is_sound)] if is_sound.any() else np.arange(float(ts.shape[1]))
+    return np.where(is_sound[:, None], ts, any_times), wrong
 
 
 def _start_one_by_one(role: str, function: Callable, points: dict[str, np.ndarray], complaints: dict[int, str]):
@@ -324,7 +347,7 @@ _INCONSISTENT = code_of(RESULTS.inconsistent_start)
 @functools.lru_cache(maxsize=8)
 def _hybrid_batch(scene: Hybrid, axes: tuple, **tolerances) -> Callable:
     follow_member = functools.partial(simulate, scene, throw=False, **tolerances)
-    return jax.jit(jax.vmap(follow_member, in_axes=(*axes[:2], None, axes[2])))
+    return jax.jit(jax.vmap(follow_member, in_axes=axes))
 
 
 def run_batch(description: Description, values: dict[str, PyTree], ts, axes: tuple) -> tuple[Trajectory, Any]:
@@ -334,7 +357,8 @@ def run_batch(description: Description, values: dict[str, PyTree], ts, axes: tup
     q0, qdot0, params = values.values()
     if jumps(system):
         tolerances = {name: settings[name] for name in ("rtol", "atol", "max_steps")}
-        return _hybrid_batch(system, axes, **tolerances)(q0, qdot0, ts, params), None
+        of_times = None if ts.ndim == 1 else 0
+        return _hybrid_batch(system, (*axes[:2], of_times, axes[2]), **tolerances)(q0, qdot0, ts, params), None
     if sections is None:
         return simulate_batch(system, q0, qdot0, ts, params, batch_axes=axes, **settings), None
     of_leaves, size = axes_per_leaf(values, axes)

@@ -119,10 +119,11 @@ def _unit_size(unit: int | None, shape: tuple[int, ...], seconds: float, quantit
 
 def _members_in_memory(description: Description, points: dict[str, np.ndarray]) -> int:
     """The members whose paths, and what is noted on the way, take `PATH_BYTES`; none where one takes more."""
-    q, qdot, _ = description.evaluate_start({name: x[0] for name, x in points.items()})
+    first = {name: x[0] for name, x in points.items()}
+    q, qdot, _ = description.evaluate_start(first)
     states, sections = 2 * Layout.from_state(q, qdot).size, description.sections
     noted = len(sections.functions) * (sections.count + 1) * (states + 1) if sections else 0
-    return _batch.PATH_BYTES // (8 * (states * len(description.ts) + noted))
+    return _batch.PATH_BYTES // (8 * (states * description.count_outputs(first) + noted))
 
 
 def _require_names(quantities: list[Quantity], axes: tuple[Axis, ...], reduce: dict) -> None:

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine.taylor import MachineCode
-from lagjax._interface import accept, require_budget
+from lagjax._interface import accept, output_times, require_budget
 from lagjax._interface.reads import array_text, hash_of, identity, source, strip_addresses
 from lagjax._run import directions_of, sections_of
 from lagjax._run.hybrid import Hybrid, Scene
@@ -98,7 +98,7 @@ class Description:
     """The work for each member: the scene, its start as values or functions of a point, and what is kept."""
 
     system: Scene
-    ts: np.ndarray
+    ts: Any  # output times (T,), or a function of a point
     q0: Any
     qdot0: Any
     params: Any
@@ -110,14 +110,12 @@ class Description:
 
     def evaluate_start(self, point: dict[str, Any]) -> tuple[PyTree, ...]:
         """(q0, qdot0, params) of the member at a point. Raises `ValueError` where they ask it for another name."""
-        try:
-            return tuple(x(point) if callable(x) else x for x in (self.q0, self.qdot0, self.params))
-        except KeyError as why:
-            if why.args[:1] and why.args[0] in point:
-                raise
-            raise ValueError(
-                f"q0, qdot0 or params asks for {why}: a point has the names of `over`, which are {', '.join(point)}."
-            ) from why
+        return _evaluate_at(point, self.q0, self.qdot0, self.params)
+
+    def count_outputs(self, point: dict[str, Any]) -> int:
+        """The number of output times of every member; raises where those of the member at a point are none."""
+        (ts,) = _evaluate_at(point, self.ts)
+        return len(output_times(ts, float))
 
     def shapes(self, names: list[str]) -> tuple[PyTree, ...]:
         """(q0, qdot0, params) of a member whose point has these names: shapes, or numbers that are as good."""
@@ -128,13 +126,28 @@ class Description:
 
     def described(self) -> dict:
         ts, solver, watched = self.ts, self.settings["solver"], self.sections
+        shared = (
+            None if callable(ts) else {"ends": [*map(float, ts[[0, -1]])], "outputs": len(ts), "sha256": hash_of(ts)}
+        )
         return {
-            "ts": {"ends": [float(ts[0]), float(ts[-1])], "outputs": len(ts), "sha256": hash_of(ts)},
+            "ts": shared,
             **{name: _value_text(self.settings[name]) for name in ("rtol", "atol", "max_steps")},
             "solver": None if solver is None else identity(solver),
             "crossings": watched and {name: getattr(watched, name) for name in ("names", "directions", "count")},
             "reduce": {name: how.described() for name, how in self.reduce.items()},
         }
+
+
+def _evaluate_at(point: dict[str, Any], *values) -> tuple[PyTree, ...]:
+    """Values, or those of functions at a point. Raises `ValueError` where they ask it for another name."""
+    try:
+        return tuple(x(point) if callable(x) else x for x in values)
+    except KeyError as why:
+        if why.args[:1] and why.args[0] in point:
+            raise
+        raise ValueError(
+            f"ts, q0, qdot0 or params asks for {why}: a point has the names of `over`, which are {', '.join(point)}."
+        ) from why
 
 
 def uses_doubles() -> bool:
@@ -163,7 +176,7 @@ def texts(description: Description, names: list[str]) -> dict[str, dict[str, str
     for name, section in description.sections.named_functions().items() if description.sections else ():
         of_section = _defer_trace(accept(section, "section"), (q, qdot), params)
         entries[f"crossings of {name}"] = _entry(section, of_section)
-    for role in ("q0", "qdot0", "params"):
+    for role in ("q0", "qdot0", "params", *(["ts"] if callable(description.ts) else [])):
         value = getattr(description, role)
         entries[role] = _entry(value, (lambda f=value: jax.make_jaxpr(f)(point)) if callable(value) else None)
     entries["keep"] = _entry(description.keep, None)

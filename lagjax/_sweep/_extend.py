@@ -43,7 +43,7 @@ def require_extensible(old: Files, now: dict) -> None:
         lines.append(f"names of over: {names[0]} in the store, now {names[1]}")
     if spec["reduce"]:
         lines.append("reduce: statistics do not tell of single members, so that none of them is known")
-    if lines and spec["ts"] != now["ts"]:
+    if lines and spec["ts"] and spec["ts"] != now["ts"]:
         lines.append(
             "The kept values do not determine how a motion continues. For a later end give ts that begin at "
             f"{spec['ts']['ends'][1]:g}, where the motions of that store end; else leave extend= away."
@@ -130,7 +130,8 @@ class LaterEnd(NamedTuple):
 
 
 def continues(other: Files, description: Description) -> bool:
-    return float(description.ts[0]) == other.spec()["ts"]["ends"][1]
+    shared = other.spec()["ts"]
+    return shared is not None and float(description.ts[0]) == shared["ends"][1]
 
 
 def later_end_of(other: Files, axes: tuple[Axis, ...], description: Description) -> LaterEnd | None:

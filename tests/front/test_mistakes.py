@@ -75,7 +75,10 @@ BALL = lagjax.Hybrid(
         (lambda: lagjax.periodic_orbit(SPRING, 1.0, 0.0, MASS), "period must be a real number; .* Parameters"),
         (lambda: lagjax.simulate(SPRING, 1.0, 0.0, MASS, TS), "ts must be an array .* got dict. Parameters"),
         (lambda: _sweep(MASS), "ts must be an array of output times; got dict"),
-        (lambda: _sweep(lambda point: TS), "which all members share; got a function. For ends of their own .* event="),
+        (
+            lambda: _sweep(lambda point: TS, {"section": lambda q, v: q}, lambda run, crossings: {"q": run.q[-1]}),
+            "crossings of sweep: for members that share their times. Give ts as an array",
+        ),
         (
             lambda: _sweep(TS, {"section": lambda q, v: q}),
             r"ask for them by name: write keep\(trajectory",
@@ -118,10 +121,7 @@ def test_names_of_another_package_are_told_ours():
     assert not hasattr(run, "nothing") and pickle.loads(pickle.dumps(eqx.tree_at(lambda r: r.system, run, None))).ok
 
 
-def _sweep(ts, crossings=None):
-    def keep(run, found):
-        return {"q": run.q[-1]}
-
+def _sweep(ts, crossings=None, keep=lambda run, found: {"q": run.q[-1]}):
     more = {"params": MASS, "keep": keep, "store": lagjax.Store("not-made", crossings=crossings)}
     return lagjax.sweep(SPRING, {"a": np.linspace(0.0, 1.0, 3)}, ts, q0=lambda point: point["a"], qdot0=0.0, **more)
 

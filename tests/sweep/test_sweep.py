@@ -346,6 +346,29 @@ def test_failures_cost_the_others_nothing(tmp_path):
     assert np.isnan(ends[~well]).all()
 
 
+def test_members_have_times_of_their_own(tmp_path):
+    def times(point):  # periods of small swings; for one length none that can be followed
+        period = jnp.where(point["length"] > 1.4, jnp.nan, 2 * jnp.pi * jnp.sqrt(point["length"] / GRAVITY))
+        return jnp.linspace(0.0, 3 * period, 7)
+
+    def keep_times(run):
+        return {"t": run.ts, "q": run.q, "between": run.at(0.4 * run.ts[-1]).q}
+
+    rule = {**RULE, "store": tmp_path / "store", "keep": keep_times}
+    run = run_sweep(PENDULUM, OVER, times, **rule)
+    data, periods = run.open(), 2 * np.pi * np.sqrt(OVER["length"] / GRAVITY)
+    np.testing.assert_allclose(data.t[:-1, 3, -1], 3 * periods[:-1], rtol=1e-14)
+    for k, ts in enumerate(data.t[:-1, 2].values):
+        alone = lagjax.simulate(PENDULUM, OVER["angle"][2], 0.0, ts, OVER["length"][k])
+        np.testing.assert_allclose(data.q[k, 2], alone.q, rtol=1e-12)
+        np.testing.assert_allclose(data.between[k, 2], alone.at(0.4 * ts[-1]).q, rtol=1e-9)
+    told = run.status()
+    assert told.results == {"successful": 35, "keep_failed": 7} and np.isnan(data.q[-1]).all()
+    assert "ts returned times that are not finite" in told.failures[0].why
+    with pytest.raises(ValueError, match="ts"):
+        run_sweep(PENDULUM, OVER, lambda point: times(point)[:5], **rule)
+
+
 def test_keep_in_numpy_may_fail_for_a_member(tmp_path):
     def uneven(trajectory):
         if trajectory.params == 0.7:
@@ -536,7 +559,7 @@ def test_a_store_whose_creation_was_interrupted_is_made_anew(tmp_path, undisturb
         (dict(over={"result": [1.0]}), "twice"),
         (dict(over={("a", "b"): ([1.0], [1.0, 2.0])}), "one length"),
         (dict(over={"angle": [np.nan]}), "not finite"),
-        (dict(q0=0.0, params=1.0), "None of q0, qdot0 and params"),
+        (dict(q0=0.0, params=1.0), "None of q0, qdot0, params and ts"),
         (dict(keep=lambda trajectory: trajectory.q), "must return a dict"),
         (dict(keep=lambda trajectory: {"angle": trajectory.q}), "another name"),
         (dict(reduce={"nothing": lagjax.Statistics()}), "does not return"),
