@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from typing import NamedTuple
 
+import numpy as np
+
 from lagjax._program import OPERATIONS, Formulas, Product, Sum
 
 LEAST_NAMED = 5  # operations of a part that has a name where it comes twice; sin(a - b) stays where it is
@@ -170,12 +172,16 @@ def _rank(name: str) -> tuple[int, str]:
 def _number(c: float) -> tuple[str, str]:
     """A positive number above and below the line of a fraction: 0.5, or 1 and 3."""
     simple = Fraction(c).limit_denominator(_LARGEST_DENOMINATOR)
+    with np.errstate(over="ignore", under="ignore"):
+        single = np.float32(c)
     for digits in (_SHORT, 15):
         shorter = f"{c:.{digits}g}".replace("e+", "e").replace("e0", "e").replace("e-0", "e-")
         if abs(float(shorter) - c) <= _ROUNDING * c:
             return shorter, "1"
         if simple and abs(float(simple) - c) <= _ROUNDING * c:
             return str(simple.numerator), str(simple.denominator)
+        if float(single) == c:  # of a scene in float32, which has 9.81 as 9.8100004196167
+            return str(single), "1"
     return repr(c), "1"
 
 

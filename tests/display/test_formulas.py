@@ -238,11 +238,19 @@ def test_q_may_be_any_pytree_and_params_may_hold_whole_numbers():
 NUMBERS = lagjax.System(lambda q, v: 0.5 * v**2 - 3 * 0.1 * q - q**2 / 6 + 1e-9 * q**3 + 2.5e12 * q**4 - np.pi * q**5)
 
 
+OSCILLATOR_OF_DIGITS = lagjax.System(lambda q, v: 0.5 * v**2 - 4.905 * q**2, forces=lambda q, v: -0.3 * v)
+
+
 def test_numbers_print_short_and_come_back():
     """0.1 · 3 is 0.30000000000000004, a third is a fraction, and large and small ones have exponents."""
     (force,) = NUMBERS.equations(1.0, 1.0).force.values()
     assert force == "3e-9*q**2 + 1e13*q**3 - q/3 - 15.707963267948966*q**4 - 0.3"
     require_equal(NUMBERS, 1.0, 1.0)
+
+
+def test_numbers_of_float32_have_its_digits():
+    with jax.enable_x64(False):
+        assert OSCILLATOR_OF_DIGITS.equations(1.0, 1.0).force["q"] == "-9.81*q - 0.3*q_dot"
 
 
 def test_a_notebook_shows_them_in_latex():
