@@ -74,8 +74,11 @@ class Layout:
 
     def flatten(self, tree: PyTree) -> Float[Array, " n"]:
         """The leaves of one state's q or qdot end to end, n = `size`."""
-        leaves = [jnp.ravel(jnp.asarray(leaf, self.dtype)) for leaf in jax.tree.leaves(tree)]
-        return jnp.concatenate(leaves)
+        leaves = jax.tree.leaves(tree)
+        if not any(isinstance(leaf, jax.Array) for leaf in leaves):  # one transfer instead of some operations
+            return jnp.asarray(np.concatenate([np.ravel(np.asarray(leaf, self.dtype)) for leaf in leaves]))
+        leaves = [jnp.ravel(jnp.asarray(leaf, self.dtype)) for leaf in leaves]
+        return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)
 
     def restore(self, flat: Float[Array, "... n"] | np.ndarray) -> PyTree:
         """The user's pytree of one vector (n,), or of many: leaves of shape (..., *the shape of the leaf)."""
