@@ -5,6 +5,7 @@ What has a negative power is written below the line of a fraction.
 """
 
 import keyword
+import math
 import re
 import unicodedata
 from collections import Counter
@@ -19,6 +20,7 @@ from lagjax._program import OPERATIONS, Formulas, Product, Sum
 LEAST_NAMED = 5  # operations of a part that has a name where it comes twice; sin(a - b) stays where it is
 _SHORT = 6  # digits of a number that is printed as it is; another one is a fraction where that is simple
 _LARGEST_DENOMINATOR, _ROUNDING = 12, 4e-16
+_NOT_FINITE = {"inf": ("inf", r"\infty"), "nan": ("nan", r"\mathrm{nan}")}  # in Python and in LaTeX
 _PARAMETER, _COORDINATE, _FUNCTION, _VELOCITY = range(4)
 
 
@@ -104,7 +106,7 @@ class FormulaWriter:
         return atom.kind + (str(abs(atom.position) % 1000) if atom.kind in ("take", "locate") else "")
 
     def _product(self, product: Product, c: float) -> str:
-        above, below = _number(c)
+        above, below = _number(c) if math.isfinite(c) else (_NOT_FINITE[str(c)][self.style is LATEX], "1")
         factors = sorted(product, key=lambda of: self._place(of[0]))
         upper = [above] * (above != "1") + [self._factor(atom, p) for atom, p in factors if p > 0]
         lower = [below] * (below != "1") + [self._factor(atom, -p) for atom, p in factors if p < 0]
@@ -222,7 +224,7 @@ def input_names(coordinates: Sequence[str], numbers: Sequence[str]) -> list[Name
 
 def short_names(labels: Sequence[str]) -> list[str]:
     """Identifiers for labels such as q['theta1'], by their keys where these say which is meant."""
-    short = [x + "_" * (keyword.iskeyword(x) or x in OPERATIONS) for x in map(_identifier, labels)]
+    short = [x + "_" * (keyword.iskeyword(x) or x in OPERATIONS or x in _NOT_FINITE) for x in map(_identifier, labels)]
     often = Counter(short)
     return [x if often[x] == 1 else "_".join(re.findall(r"\w+", of)) for x, of in zip(short, labels, strict=True)]
 
