@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax._analysis._closed_contacts import hold_closed, one_sided_reason
+from lagjax._analysis._closed_contacts import HeldScene, hold_closed, one_sided_reason
 from lagjax._analysis._eigen import tangent_basis
 from lagjax._analysis._equilibrium import least_multipliers
 from lagjax._analysis._scene_state import SceneState, require_matrices
@@ -205,7 +205,8 @@ def linearize(
       `inputs`. By default y is the whole state, as in the package control.
     - `dt`: the sample time, during which inputs are held. Φ and Γ are the derivatives of the motion from the state by
       where it starts and by the inputs, to 1e-12 for each step of it; at an equilibrium they are those of
-      `scipy.signal.cont2discrete`.
+      `scipy.signal.cont2discrete`. Contacts that are open at the state may strike within dt; a closed one that opens
+      then is an error.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, for a scene that depends on the time, for
     constraints that ask for inputs, and for a state at which the force jumps or has a kink, as dry friction at rest
@@ -245,7 +246,7 @@ def linearize(
     shown = None if sensor is None else _output_names(sensor, scene, of_inputs is not None)
     names = LinearNames(layout.names, tuple(f"u{re.sub('^(q|inputs)', '', name)}" for name in pushed), shown)
     found, of_state = _linearize(of_inputs, sensor, *scene.arguments)
-    return Linearization._make((*found, names, *of_state, None if dt is None else _sample(scene, of_inputs, dt)))
+    return Linearization._make((*found, names, *of_state, None if dt is None else _sample(scene, held, of_inputs, dt)))
 
 
 def _require_inputs(system: System, sensor: Function | None, inputs: PyTree) -> PyTree:
@@ -340,22 +341,56 @@ def _linearize(of_inputs: Layout | None, sensor: Function | None, *arguments) ->
     return matrices, (*_output_matrices(of_inputs, sensor, scene, u), jnp.hstack(allowed[:2]))
 
 
-def _sample(scene: SceneState, of_inputs: Layout | None, dt) -> tuple[Array, Array]:
-    """Φ (2n, 2n) and Γ (2n, m). Raises `ValueError` where the motion cannot be followed over dt."""
+def _sample(scene: SceneState, held: HeldScene | None, of_inputs: Layout | None, dt) -> tuple[Array, Array]:
+    """Φ (2n, 2n) and Γ (2n, m). Raises `ValueError` where the motion cannot be followed over dt.
+
+    Contacts that are open at the state may close within dt: the motion is that with them.
+    """
     require_number(dt, "dt")
     if is_concrete(dt) and not 0 < dt < np.inf:
         raise ValueError(f"dt is the sample time, a positive number; got {dt}.")
-    system, params = scene.system, scene.params
+    given = scene.system if held is None else held.given
+    system, params = given if held is None or not held.places else scene.system, scene.params
     if of_inputs is None:  # u are generalised forces
         none = scene.layout.restore(jnp.zeros_like(scene.q))
-        system, params, of_inputs = drive_scene(push_by_inputs(system), held_inputs), Driven(params, none), scene.layout
-    phi, gamma = _flow_derivatives(of_inputs, dt, system, scene.layout, scene.q, scene.qdot, params)
+        given, system = (drive_scene(push_by_inputs(x), held_inputs) for x in (given, system))
+        params, of_inputs = Driven(params, none), scene.layout
+    state = scene.layout, scene.q, scene.qdot, params
+    phi, gamma = _flow_derivatives(of_inputs, dt, system, *state)
+    if held is not None and held.places:
+        phi, gamma = _require_same_end(dt, given, system, state, (phi, gamma))
     if all(map(is_concrete, (phi, gamma))) and not np.isfinite(phi).all():
         raise ValueError(
             f"The motion from this state cannot be followed over dt = {dt}, or has no derivative there: "
             "lagjax.simulate(system, q, qdot, [0, dt], params) says why. Give a shorter dt, or another state."
         )
     return phi, gamma
+
+
+def _require_same_end(dt, given: System, system: System, state: tuple, sampled: tuple) -> tuple:
+    """`sampled` of a scene whose closed contacts are held. Raises `ValueError` where one opens, or another closes."""
+    same = _ends_are_equal(dt, given, system, *state)
+    if not is_concrete(same):
+        return tuple(nan_unless(same, x) for x in sampled)
+    if not same:
+        raise ValueError(
+            f"Within dt = {dt} a contact that is closed at this state opens, or another one closes: Φ and Γ are those "
+            "of contacts that stay as they are. Give a shorter dt, or another state."
+        )
+    return sampled
+
+
+@eqx.filter_jit
+def _ends_are_equal(dt, given: System, system: System, layout: Layout, q, qdot, params: Driven) -> Array:
+    """Whether the motion over dt of a scene with its contacts ends where that with its closed contacts held does."""
+    ts = jnp.stack([jnp.zeros((), q.dtype), jnp.asarray(dt, q.dtype)])
+    start = layout.restore(q), layout.restore(qdot)
+    ends = [simulate(of, *start, ts, params, rtol=_RTOL, throw=False).end for of in (given, system)]
+    equal = True
+    for one, other in (map(layout.flatten, x) for x in zip(*((end.q, end.qdot) for end in ends), strict=True)):
+        size = jnp.max(jnp.abs(other)) + jnp.max(jnp.abs(one))
+        equal &= jnp.all(jnp.abs(one - other) <= _SAME_END * size)
+    return equal
 
 
 @eqx.filter_jit
@@ -372,6 +407,7 @@ def _flow_derivatives(of_inputs: Layout, dt, system: System, layout: Layout, q, 
     return jnp.hstack(of_state), of_u
 
 
+_SAME_END = 1e-6  # of the largest coordinate or velocity: what six digits leave of a gap that is zero
 _RTOL = 1e-12  # of a step: what the order of Taylor series makes cheap, and rounding leaves room for
 
 

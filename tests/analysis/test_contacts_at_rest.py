@@ -100,3 +100,22 @@ def test_constraints_come_along_and_singles_too():
         rest = lagjax.equilibrium(ROD, jnp.array([0.6, 0.8], dtype))
         np.testing.assert_allclose(rest.multipliers["rod"], G / 1.6, rtol=rtol)
         np.testing.assert_allclose(rest.contact_forces["wall"], 3 + 1.2 * G / 1.6, rtol=rtol)
+
+
+BALL = lagjax.System(lambda q, v: 0.5 * v @ v - G * q[1], contacts=lambda q: q[1], restitution=0.5)
+HILL = lagjax.System(lambda q, v: 0.5 * v @ v - G * q[1], contacts=lambda q: q @ q - 1)
+
+
+def test_a_sample_time_has_the_impacts_within_it():
+    """A ball falls from h onto the floor: after the impact v = 0.5 u − G (t − u/G) with u² = 2 G h."""
+    height, dt = 0.1, 0.2
+    linear, u = lagjax.linearize(BALL, np.array([0.0, height]), dt=dt), (2 * G * height) ** 0.5
+    np.testing.assert_allclose(linear.Phi[3, 1], 1.5 * G / u, rtol=1e-9)
+    np.testing.assert_allclose(linear.Phi[1, 1], 1.5 * G * dt / u - 2, rtol=1e-9)  # v at the impact: 0.5 u
+
+
+def test_a_contact_that_opens_within_the_sample_time_is_an_error():
+    top = np.array([np.sin(0.5), np.cos(0.5)]), 2.0 * np.array([np.cos(0.5), -np.sin(0.5)])
+    assert lagjax.linearize(HILL, *top, dt=0.05).Phi.shape == (4, 4)
+    with pytest.raises(ValueError, match="a contact that is closed at this state opens"):
+        lagjax.linearize(HILL, *top, dt=0.5)
