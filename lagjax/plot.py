@@ -474,11 +474,14 @@ def _stroboscopic_points(scene, over, start: tuple, value: Callable | None, tran
         run = simulate(scene, q0, qdot0, ts, params, throw=False)
         seen = jax.tree.map(lambda x: x[1:], (run.q, run.qdot))
         if value is not None:
-            return jax.vmap(value)(*seen)
+            return jax.vmap(value)(*seen), strobe
         shown.append(Layout.from_state(*jax.tree.map(lambda x: x[0], seen)).names[0])
-        return jax.tree.leaves(seen[0])[0].reshape(len(times), -1)[:, 0]
+        return jax.tree.leaves(seen[0])[0].reshape(len(times), -1)[:, 0], strobe
 
-    found = jax.jit(jax.vmap(follow))(dict(zip(names, columns, strict=True)))
+    found, strobes = jax.jit(jax.vmap(follow))(dict(zip(names, columns, strict=True)))
+    if not (right := (np.asarray(strobes) > 0) & np.isfinite(strobes)).all():
+        wrong = np.asarray(strobes)[~right][0]
+        raise ValueError(f"strobe is the period of the drive, a positive number; got {wrong:g}.")
     if found.shape != (columns.shape[1], len(times)):
         raise ValueError(f"value must return one number for one state; got shape {found.shape[2:]}.")
     return columns[0], np.asarray(found), (names[0], *(shown or ["value"]))

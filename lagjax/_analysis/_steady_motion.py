@@ -116,10 +116,12 @@ def steady_motion(
 
 
 def _chosen(scene: SceneState, hold: Any) -> np.ndarray:
-    """The coordinates and the velocities (2, n) that `hold` names. Raises `ValueError` for other names."""
+    """The coordinates and the velocities (2, n) that `hold` names. Raises an error for what names none."""
     names = scene.layout.names
     both = names, tuple(f"qdot{name.removeprefix('q')}" for name in names)
     chosen = np.zeros((2, len(names)), bool)
+    if not (hold is None or np.iterable(hold)):
+        raise TypeError(f"hold is a name, such as 'qdot[0]', or a tuple of names; got {hold!r}.")
     for wanted in (hold,) if isinstance(hold, str) else hold or ():
         named = np.array([[_names(name, wanted) for name in of] for of in both])
         if not named.any():

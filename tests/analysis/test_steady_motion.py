@@ -191,6 +191,8 @@ def test_transformations():
 def test_wrong_arguments():
     with pytest.raises(ValueError, match=r"hold names 'lean', and the numbers are q\['lean'\]"):
         lagjax.steady_motion(WHEEL, REST, rolling(1.0), DISC, hold="lean")
+    with pytest.raises(TypeError, match=r"hold is a name, such as .*; got 3"):
+        lagjax.steady_motion(WHEEL, REST, rolling(1.0), DISC, hold=3)
     with pytest.raises(ValueError, match=r"qdot\['lean'\] cannot be held at 1.0"):
         lagjax.steady_motion(WHEEL, REST, rolling(1.0, lean=1.0), DISC, hold="qdot['lean']")
     with pytest.raises(ValueError, match="No steady motion was found near the state"):

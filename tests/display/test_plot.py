@@ -441,6 +441,7 @@ def test_rows_of_a_lattice(rotor):
         (lambda run: lagjax.plot.phase(run, period={"a": 1.0}), "period is .*, which does not fit the structure of q"),
         (lambda run: lagjax.plot.bifurcation(OSCILLATORS, np.ones(3)), "over must be a dict"),
         (lambda run: lagjax.plot.bifurcation(OSCILLATORS, {"A": [1.0]}), "strobe is the period of the drive"),
+        (lambda run: lagjax.plot.bifurcation(OSCILLATORS, {"A": [1.0]}, lambda of: 0 * of["A"]), "number; got 0"),
         (lambda run: lagjax.plot.bifurcation(OSCILLATORS, {"A": [1.0]}, 1.0), "Nothing depends on A: give params as"),
         (lambda run: lagjax.plot.bifurcation(OSCILLATORS, {"A": [1.0], "B": [1.0]}, 1.0), "over must have one axis"),
         (lambda run: lagjax.plot.bifurcation(run.ts, run.q[:-1]), r"got \(40, 2\) and \(41,\)"),
