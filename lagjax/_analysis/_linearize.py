@@ -369,7 +369,7 @@ def _sample(scene: SceneState, held: HeldScene | None, of_inputs: Layout | None,
 
 def _require_same_end(dt, given: System, system: System, state: tuple, sampled: tuple) -> tuple:
     """`sampled` of a scene whose closed contacts are held. Raises `ValueError` where one opens, or another closes."""
-    same = _ends_are_equal(dt, given, system, *state)
+    same = _compare_ends(dt, given, system, *state)
     if not is_concrete(same):
         return tuple(nan_unless(same, x) for x in sampled)
     if not same:
@@ -381,8 +381,8 @@ def _require_same_end(dt, given: System, system: System, state: tuple, sampled: 
 
 
 @eqx.filter_jit
-def _ends_are_equal(dt, given: System, system: System, layout: Layout, q, qdot, params: Driven) -> Array:
-    """Whether the motion over dt of a scene with its contacts ends where that with its closed contacts held does."""
+def _compare_ends(dt, given: System, system: System, layout: Layout, q, qdot, params: Driven) -> Array:
+    """True if the motion over dt of a scene with its contacts ends where that with its closed contacts held does."""
     ts = jnp.stack([jnp.zeros((), q.dtype), jnp.asarray(dt, q.dtype)])
     start = layout.restore(q), layout.restore(qdot)
     ends = [simulate(of, *start, ts, params, rtol=_RTOL, throw=False).end for of in (given, system)]
