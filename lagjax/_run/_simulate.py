@@ -19,7 +19,17 @@ import numpy as np
 from lagjax._engine import AbstractEngine, Batch, Problem, Solution, axes_per_leaf, choose, requested_engine
 from lagjax._engine.taylor import MachineCode
 from lagjax._equations import has_constraints, inconsistent_members, require_consistent
-from lagjax._interface import ENDED_WELL, RESULTS, Layout, advice, as_arrays, halves, require_flag, result_from
+from lagjax._interface import (
+    ENDED_WELL,
+    RESULTS,
+    Layout,
+    advice,
+    as_arrays,
+    halves,
+    output_times,
+    require_flag,
+    result_from,
+)
 from lagjax._primitives import marks_absent
 from lagjax._run._trajectory import EACH, RunSettings, State, Trajectory, raise_unless_ok, step_counts
 from lagjax._run.contacts import follow_contacts, follow_contacts_batch
@@ -241,6 +251,8 @@ def simulate_batch(
     """
     of_engines = {"solver": solver, "dt": dt, "event": event, "adjoint": adjoint, "progress": progress}
     values = {"q0": q0, "qdot0": qdot0, "params": params}
+    if not isinstance(ts, np.ndarray | jax.Array):
+        ts = output_times(ts, float, rows=True)
     axes, size = axes_per_leaf(values, batch_axes, ts)
     if isinstance(system, Hybrid):
         options = of_engines | {"rtol": rtol, "atol": atol, "max_steps": max_steps, "max_transitions": max_transitions}

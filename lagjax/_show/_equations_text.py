@@ -133,8 +133,10 @@ class _Page:
 
     def _write_latex(self) -> str:
         lines = [rf"{self.latex.parts[atom]} &= {self.latex.write_part(atom)}" for atom in self.shared]
-        shown = {"M": "mass_matrix", "F": "force", "f": "residual", "G": "jacobian", r"\gamma": "gamma"}
-        law = r"M \ddot{q} &= F" + (r" + G^{\mathsf{T}} \lambda, \quad G \ddot{q} = \gamma" if self.constraints else "")
+        m, f, place, g, gamma = (rf"\boldsymbol{{{x}}}" for x in ("M", "F", "f", "G", r"\gamma"))
+        shown = {m: "mass_matrix", f: "force", place: "residual", g: "jacobian", gamma: "gamma"}
+        held = rf" + {g}^{{\mathsf{{T}}}} \boldsymbol{{\lambda}}, \quad {g} \ddot{{\boldsymbol{{q}}}} = {gamma}"
+        law = rf"{m} \ddot{{\boldsymbol{{q}}}} &= {f}" + (held if self.constraints else "")
         for sign, name in shown.items():
             of = self.sums[name]
             if of.size and self.n <= _MOST_IN_MATRICES:

@@ -215,8 +215,10 @@ def shared_parts(formulas: Formulas, sums: Iterable[Sum]) -> list[int]:
 
 def input_names(coordinates: Sequence[str], numbers: Sequence[str]) -> list[Name]:
     """The names of q, q̇, t and the parameters, from labels such as q['theta1'] and params['m']."""
-    texts = short_names([*coordinates, "t", *numbers])
-    n = len(coordinates)
+    labels, n = [*coordinates, "t", *numbers], len(coordinates)
+    texts = short_names(labels)
+    of_rates = {f"{x}_dot" for x in texts[:n]}
+    texts = ["_".join(re.findall(r"\w+", of)) if x in of_rates else x for x, of in zip(texts, labels, strict=True)]
     q = [Name(x, latex_name(x), _COORDINATE) for x in texts[:n]]
     rates = [Name(f"{x}_dot", latex_name(x, dot=True), _VELOCITY) for x in texts[:n]]
     return [*q, *rates, Name("t", "t", _COORDINATE), *(Name(x, latex_name(x), _PARAMETER) for x in texts[n + 1 :])]

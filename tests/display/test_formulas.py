@@ -221,6 +221,15 @@ def test_names_that_coincide_are_told_apart():
     require_equal(NAMES, {"x": 1.0}, {"x": 0.3}, params)
 
 
+RATES = lagjax.System(lambda q, v, params: 0.5 * v["x"] ** 2 - params["x_dot"] * q["x"])
+
+
+def test_a_parameter_is_not_taken_for_a_velocity():
+    equations = RATES.equations({"x": 1.0}, {"x": 1.0}, params={"x_dot": 2.0})
+    assert equations.variables == ("x", "x_dot", "t", "params_x_dot")
+    require_equal(RATES, {"x": 1.0}, {"x": 0.3}, {"x_dot": 2.0})
+
+
 def of_a_tree(q, v, params):
     power = q[0]["a"][1] ** params["n"]
     return 0.5 * v[0]["a"] @ v[0]["a"] + v[1] ** 2 * power - q[1] ** 2 * params["of"][1]
