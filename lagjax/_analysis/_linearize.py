@@ -150,6 +150,16 @@ class ReducedLinearization(NamedTuple):
     Phi: Float[Array, "s s"] | None
     Gamma: Float[Array, "s m"] | None
 
+    _repr_pretty_ = show_str
+
+    def __str__(self) -> str:
+        states, inputs, outputs = np.shape(self.B)[-2], np.shape(self.B)[-1], np.shape(self.C)[-2]
+        shapes = f"Linear equations of {states} states x, {inputs} inputs and {outputs} outputs: dx/dt = A x + B u"
+        if not is_known(self.A) or np.ndim(self.A) != 2:
+            return shapes
+        modes = ", ".join(f"{x:.6g}" for x in np.sort_complex(np.linalg.eigvals(np.asarray(self.A)))[:_SHOWN])
+        return f"{shapes}\nEigenvalues of A: {modes}{', …' if states > _SHOWN else ''}"
+
 
 @compile_for_one_call
 def _remove_symmetries(a: Array, rows: Array, qdot: Vector, moves: Array, turns: Array) -> tuple[Array, Array]:
@@ -170,8 +180,14 @@ def _reduce(rank: int, rows: Array, a: Array, b: Array, c: Array, d: Array, samp
 
 
 def _equations(left: list[str], rows: np.ndarray, of: list[str]) -> list[str]:
-    """Lines such as "δq'' = -1 δq +1 u", of each of the rows (k, l) of factors, and how many more there are."""
+    """Lines such as "δq'' = -1 δq +1 u", of each of the rows (k, l) of factors, and how many more there are.
+
+    Rounding is left out: what is a few units in the last place of the largest factor of its row and its column.
+    """
     rows, more = np.asarray(rows)[:_SHOWN], len(left) - _SHOWN
+    sizes = np.abs(rows)
+    bounds = np.minimum(sizes.max(axis=1, keepdims=True), sizes.max(axis=0, keepdims=True))
+    rows = np.where(sizes > 16 * np.finfo(rows.dtype).eps * bounds, rows, 0.0)
     shown = [" ".join(f"{c:+.6g} {name}" for c, name in zip(row, of, strict=True) if c) or "0" for row in rows]
     lines = [f"{name} = {line.removeprefix('+')}" for name, line in zip(left, shown, strict=False)]
     return [*lines, *([f"… ({more} more)"] if more > 0 else [])]

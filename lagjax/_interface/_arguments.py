@@ -55,9 +55,9 @@ class Function(eqx.Module):
         function = eqx.combine(self.arrays, self.code.function)
         if "inputs" in self.extras and "inputs" not in extras:
             raise TypeError(
-                f"{self.name} asks for `inputs`, which only the records of lagjax.fit have, and lagjax.linearize(…, "
-                "inputs=…). To follow a motion with sampled inputs, let it ask for `t` instead, and call "
-                "lagjax.samples(knots, values)(t)."
+                f"{self.name} asks for `inputs`, and there are none: the records of lagjax.fit have them, and "
+                "linearize, System.equations and System.to_c take inputs=…. What is held during a motion is a parameter: let it "
+                "read params. For sampled inputs let it ask for `t`, and call lagjax.samples(knots, values)(t)."
             )
         try:
             with self.code.traced():

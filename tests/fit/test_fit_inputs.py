@@ -308,5 +308,7 @@ def test_what_is_wrong_with_inputs_is_a_sentence():
         lagjax.Record(TS, u, {"u": np.where(np.arange(len(u)) == 3, np.nan, u)})
     with pytest.raises(TypeError, match=r"start must be .*a function of the parameters"):
         lagjax.Record(TS, u, start=3.0)
-    with pytest.raises(TypeError, match=r"driven asks for `inputs`, which only the records of lagjax.fit have"):
+    with pytest.raises(
+        TypeError, match=r"driven asks for `inputs`, and there are none: the records of lagjax.fit have"
+    ):
         lagjax.simulate(SCENE, 0.0, 0.0, np.array([0.0, 1.0]), TRUTH)
