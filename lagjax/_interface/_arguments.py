@@ -56,8 +56,9 @@ class Function(eqx.Module):
         if "inputs" in self.extras and "inputs" not in extras:
             raise TypeError(
                 f"{self.name} asks for `inputs`, and there are none: the records of lagjax.fit have them, and "
-                "linearize, System.equations and System.to_c take inputs=…. What is held during a motion is a parameter: let it "
-                "read params. For sampled inputs let it ask for `t`, and call lagjax.samples(knots, values)(t)."
+                "linearize, System.equations and System.to_c take inputs=…. What is held during a motion is a "
+                "parameter: let it read params. For sampled inputs let it ask for `t`, and call lagjax.samples(knots, "
+                "values)(t)."
             )
         try:
             with self.code.traced():
