@@ -278,7 +278,7 @@ def _solve_balance(has_terms: bool, steady: Steady | None, *arguments) -> tuple[
         return (x, scene.qdot) if steady is None else steady.state(scene, x)
 
     def force_at(q: Vector, qdot: Vector) -> Vector:
-        """F − M q̈, q̈ = Σ q̇ᵢ Ωᵢ q̇."""
+        """F − M q̈ (n,), with the q̈ = Σ q̇ᵢ Ωᵢ q̇ of a steady motion; F alone at rest."""
         force = scene.force(q, qdot)
         if steady is None:
             return force

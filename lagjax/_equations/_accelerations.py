@@ -255,7 +255,7 @@ class Accelerations:
 
         The first gives the entries of A, r, factors of A and whether it is singular; the second z, of factors and r.
         """
-        n, m, regular = self.layout.size, self._rows(saddle), self._regular(saddle)
+        n, m, regular = self.layout.size, self._row_count(saddle), self._regular(saddle)
         if regular is None and not self._pivots:
             raise Unlowerable(_INDEFINITE)
         zeros = self.of.absent("mass_matrix"), self.of.absent("jacobian")[:m]
@@ -331,7 +331,7 @@ class Accelerations:
         cut = functools.cache(lambda: self.of.whole.select_outputs(positions))
         return lambda *scalars: cut().vector(*scalars)
 
-    def _rows(self, saddle: _Saddle) -> int:
+    def _row_count(self, saddle: _Saddle) -> int:
         return self.of.shape("jacobian")[0] if saddle.velocities else self.of.position_count
 
     @lowered_once
@@ -372,10 +372,10 @@ class Accelerations:
         a scene counts as positive definite that is so at all states near, or at all far away.
         """
         for reach in (1.0, _FAR):
-            if (regular := self._judge(self.samples(reach), self._rows(saddle))) is not None:
+            if (regular := self._judge(self.samples(reach), self._row_count(saddle))) is not None:
                 return regular
         samples = self.samples(1.0, self._favorable) if self.of.counts_on_params else None
-        return None if samples is None else self._judge(samples, self._rows(saddle))
+        return None if samples is None else self._judge(samples, self._row_count(saddle))
 
     def _judge(self, samples: "list[tuple[_Entries, _Entries]]", m: int) -> bool | None:
         """True if M is regular at some states; None where it is not positive definite, on m rows of G at rest."""
@@ -401,7 +401,7 @@ class Accelerations:
 
     def suit(self, numbers: np.ndarray) -> bool:
         """True if M is positive definite with these parameters, at all sampled states near or at all far away."""
-        rows = self._rows(_ACCELERATION)
+        rows = self._row_count(_ACCELERATION)
         return any(self._judge(self.samples(reach, numbers), rows) is not None for reach in (1.0, _FAR))
 
     @property

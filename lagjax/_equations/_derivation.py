@@ -95,7 +95,7 @@ class Derivation:
 
     @functools.cached_property
     def lowered(self) -> "Derivation":
-        """The derivation as scalar programs of a large scene too, as far as machine code takes it."""
+        """This derivation on scalars: itself, or for a large scene one that refuses beyond `LARGEST_LOWERED`."""
         if not self.form.is_sparse:
             return self
         motion = Motion(*list(vars(self.motion).values())[:4])
@@ -105,10 +105,10 @@ class Derivation:
         return Derivation(motion, self.layout, self.numbers, refusal, self.unhashable, "scalar", self.counts_on_params)
 
     def with_numbers(self, numbers=None) -> "Derivation":
-        """The derivation for these numbers of params; None, or traced ones, may be any.
+        """The derivation to use with these numbers of params; None and traced numbers are unknown.
 
-        Where nothing pivots, and parameters decide whether M is positive definite, it counts on that, unless these are
-        known and make another M.
+        If nothing pivots, and params decide whether M is positive definite, it is one that assumes so, unless known
+        numbers contradict it.
         """
         doubted = self._counting_on_params
         known = doubted is not None and numbers is not None and is_concrete(numbers)

@@ -67,7 +67,7 @@ class _ScalarState:
         return value
 
     def taped(self, function: Callable) -> "_Taped":
-        """A function of (q, q̇, t, params) with one value, as it is written."""
+        """The tape of a function of (q, q̇, t, params) with one value: its operations as written, for `gradient`."""
         tape = Tape(self.expansion.graph.budget, self.expansion.graph.moving)
         written = Expansion(tape)
         inputs = [i for leaf in jax.tree.leaves(list(self.ids.values())) for i in leaf.ravel().tolist()]

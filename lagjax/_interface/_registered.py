@@ -9,7 +9,10 @@ from typing import Any, NamedTuple
 
 
 class Registered(NamedTuple):
-    """The functions, of a scene, a trajectory or a table in it; `units` and `time_unit` are those of `to_xarray`."""
+    """The functions of rooms above that a scene, a trajectory or one of its tables calls.
+
+    A dataset and a frame take the `units` and the `time_unit` of `to_xarray`.
+    """
 
     summary: Callable[[Any], str]
     trajectory_html: Callable[[Any], str | None]

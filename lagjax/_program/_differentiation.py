@@ -97,12 +97,11 @@ class Derivatives:
     def gradient(
         self, tape: Tape, nodes: list[int], output: int, by: Sequence[int], together: bool, again: Sequence[int] = ()
     ) -> list[int]:
-        """The derivatives of one scalar of a tape by the inputs at the positions `by`.
+        """The nodes of the derivatives of scalar `output` of a tape by its inputs at positions `by`, in that order.
 
-        What depends on the inputs `again` will be differentiated once more by these.
-
-        `nodes` holds what the tape is in the graph. The cotangents of scalars that are equal are added up at once where
-        they are to be taken `together`, else each is followed on its own as far as it is written apart.
+        `nodes[k]` is scalar k of the tape in the graph. With `together` the cotangents of equal scalars are added at
+        once, else each is followed on its own as long as it is written apart. `again` are the inputs by which the
+        result will be differentiated once more.
         """
         first: dict[tuple, int] = {}
         taken = [tape.branches.get(k) for k in range(len(nodes))]

@@ -391,10 +391,10 @@ def shorten(text: str) -> str:
 @functools.lru_cache(maxsize=4096)
 def code_text(code: types.CodeType) -> str:
     """A hash of what a function does, its numbers and names included; not of where it stands."""
-    inner = [code_text(x) if isinstance(x, types.CodeType) else _constant(x) for x in code.co_consts]
+    inner = [code_text(x) if isinstance(x, types.CodeType) else _constant_text(x) for x in code.co_consts]
     text = "\n".join([code.co_code.hex(), repr(code.co_names), repr(code.co_varnames), *inner])
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _constant(x: Any) -> str:
+def _constant_text(x: Any) -> str:
     return repr(sorted(map(repr, x))) if isinstance(x, frozenset) else repr(x)

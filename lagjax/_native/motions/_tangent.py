@@ -183,15 +183,15 @@ class Tangent:
         frame["is_due"] = 1.0
         with code.repeat_while(lambda: code.any_lane(frame["is_due"] > 0.0)):
             with code.loop(self.directions.lanes) as index:
-                self._await_output(frame, index)
+                self._find_due_outputs(frame, index)
             with code.only_if(code.any_lane(frame["is_due"] > 0.0)):
                 self.series_sum.push(self.directions, frame, "between", frame["s"])
                 with code.loop(self.directions.lanes) as index:
                     self._write_output(frame, index, group)
         return frame.finish()
 
-    def _await_output(self, frame: Frame, index: Value) -> None:
-        """The lanes whose next output lies in the step, and its distance from the beginning."""
+    def _find_due_outputs(self, frame: Frame, index: Value) -> None:
+        """Flag the lanes whose next output lies in the step (`is_due`), and note its time from the beginning (`s`)."""
         code, lane, of_motion = frame.code, frame.lane(index), self.directions.lane_of_motion(frame, index)
         member, output = of_motion["member"], code.as_integer(lane["next_output"])
         inside = (member >= 0) & (output < frame.job("times") - 1)

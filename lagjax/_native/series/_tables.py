@@ -148,7 +148,10 @@ class Tables:
     # ---- the table of a program ----
 
     def _words(self, kind: OperationKind, group: list[ScheduledOperation], places: dict[int, int]) -> list[int]:
-        """The operations of a group, all of one kind, this many at a time as there is code for."""
+        """The words of the table for a group of operations of one kind.
+
+        For as many at a time as there is code for: the number of that code, then the places of operands and results.
+        """
         start, words = 0, []
         while start < len(group):
             times = next(times for times in TIMES if times <= len(group) - start)

@@ -82,7 +82,10 @@ class NarrowFeatures:
         frame.assign(sooner, nearest=root, crossed=Crossed.NOTHING)
 
     def _approach_level(self, frame: Frame, j: Value, feature: Feature, degree: Value, h: Value) -> tuple:
-        """True if a feature matters; β, and α + β u; and how well that is to be known, of its size and absolutely."""
+        """The level α + β u of a feature, whose zero is as near as a step may come.
+
+        Returns whether the feature matters, β, the level, and the relative and absolute accuracy that it needs.
+        """
         code, kind, scale = frame.code, feature.kind, feature.scale
         u = self.motion.followed_value(frame, j)
         rise = code.lanes_of(code.as_double(degree)) * limits.RISE

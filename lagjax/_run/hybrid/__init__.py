@@ -106,7 +106,10 @@ class Hybrid:
     max_transitions: int = 32
 
     def with_sections(self, functions: tuple, directions: tuple[int, ...], room: int) -> "Hybrid":
-        """The scene with transitions behind its own that change nothing: each section in each mode, `room` times."""
+        """The scene with a transition for each section in each mode, after its own, that changes nothing.
+
+        The budget leaves room for `room` crossings of each section, and one more.
+        """
         notes = [
             Transition(mode, mode, function, way, fires="crossing")
             for mode in self.modes
