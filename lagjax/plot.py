@@ -281,7 +281,7 @@ def modes(modes: Modes, points: Callable | None = None, q: Any = None, params: A
         if points is None:
             _bars(_axes(ax), shape)
         else:
-            _swings(_axes(ax), accept(points, "points", ("q",)), q, shape, params, largest)
+            _draw_swings(_axes(ax), accept(points, "points", ("q",)), q, shape, params, largest)
         ax.set_title(_rates(modes, k), fontsize="medium")
     return axes
 
@@ -313,7 +313,7 @@ def _bars(ax, shape) -> None:
         ax.set_xticks(np.arange(layout.size), layout.names, rotation=45, ha="right", fontsize="small")
 
 
-def _swings(ax, points: Function, q, shape, params, largest: float) -> None:
+def _draw_swings(ax, points: Function, q, shape, params, largest: float) -> None:
     """The points at an equilibrium, and where a coordinate has moved by `largest` along a shape, to both sides."""
     size = max(float(jnp.max(jnp.abs(leaf))) for leaf in jax.tree.leaves(shape))
     for swing, color, style in ((0.0, GREY, "-"), (-largest, COLORS[5], "--"), (largest, COLORS[0], "-")):

@@ -402,7 +402,7 @@ def _compare_ends(dt, given: System, system: System, layout: Layout, q, qdot, pa
     ts = jnp.stack([jnp.zeros((), q.dtype), jnp.asarray(dt, q.dtype)])
     start = layout.restore(q), layout.restore(qdot)
     ends = [simulate(of, *start, ts, params, rtol=_RTOL, throw=False).end for of in (given, system)]
-    equal = True
+    equal = jnp.array(True)
     for one, other in (map(layout.flatten, x) for x in zip(*((end.q, end.qdot) for end in ends), strict=True)):
         size = jnp.max(jnp.abs(other)) + jnp.max(jnp.abs(one))
         equal &= jnp.all(jnp.abs(one - other) <= _SAME_END * size)

@@ -351,7 +351,7 @@ def _exponents(squares: Array, zero, ok=True) -> Array:
 
 
 def _general_modes(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Array, Array]:
-    """Exponents (k, 2) and complex amplitudes (k, k), a mode a column; velocities are in units of the fastest rate."""
+    """Two exponents for each mode (k, 2), and the complex amplitudes of the coordinates (k, k), a mode a column."""
     k, inverse = len(mass), factorize(mass)
     by_q, by_qdot = -inverse.solve_columns(stiffness), -inverse.solve_columns(rates)
     fastest = jax.lax.stop_gradient(jnp.maximum(jnp.sqrt(jnp.max(jnp.abs(by_q))), jnp.max(jnp.abs(by_qdot))))

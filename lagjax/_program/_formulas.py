@@ -90,11 +90,11 @@ class Formulas:
         if op == "mul":
             return self._multiply(*xs)
         if op == "div" and kind == "float":
-            return self._multiply(xs[0], self._raise(xs[1], -1))
+            return self._multiply(xs[0], self._take_power(xs[1], -1))
         if op in ("sqrt", "rsqrt"):
-            return self._raise(xs[0], 0.5 if op == "sqrt" else -0.5)
+            return self._take_power(xs[0], 0.5 if op == "sqrt" else -0.5)
         if op == "pow" and not xs[1].keys() - {ONE}:
-            return self._raise(xs[0], xs[1].get(ONE, 0.0))
+            return self._take_power(xs[0], xs[1].get(ONE, 0.0))
         if op == "convert":
             return xs[0] if kind in ("float", "bool") else self._function("trunc", xs)
         number = int(attribute) if op == "round" else -1 if attribute is None else hash(attribute)
@@ -116,7 +116,7 @@ class Formulas:
     def _factor(self, x: Sum, power: float) -> Sum:
         """A sum in a power, as one atom, without what its coefficients have in common: its first term is positive."""
         if len(x := self._shortest(x)) == 1:
-            return self._raise(x, power)
+            return self._take_power(x, power)
         sizes = {abs(c) for c in x.values()}
         size = sizes.pop() if len(sizes) == 1 else 1.0
         if power == int(power) and x[min(x, key=self._lead)] < 0:
@@ -129,7 +129,7 @@ class Formulas:
         moves = any(self.atoms[a].kind == "input" and not self._is_parameter(a) for a, _ in product)
         return not moves, product != ONE, product
 
-    def _raise(self, x: Sum, power: float) -> Sum:
+    def _take_power(self, x: Sum, power: float) -> Sum:
         if len(x) != 1:
             return self._factor(x, power) if x else raised(self._atom("sum", -1, ((),)), power)
         ((product, c),) = x.items()

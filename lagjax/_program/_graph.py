@@ -173,9 +173,9 @@ class Graph:
         return self.apply("and", self.is_huge(v), self._is_nothing(w))
 
     def is_flat_far_out(self, slope: int, u: int) -> int:
-        """True where a function has no slope as its operand u is huge: what it changes by, slope · u, is nothing.
+        """The node of a flag: true where u is huge and slope · u is zero.
 
-        At u = 0, where it is nothing, too, there is a slope; and 0 · ∞ is NaN.
+        At u = 0 it is false, although the product is zero there, too; and 0 · ∞ is NaN.
         """
         change = self.apply("mul", slope, u)
         changes = self.apply("prefers", self.apply("mul", change, change), self.constant(0.0, "float"))

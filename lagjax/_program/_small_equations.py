@@ -52,7 +52,7 @@ def transpose(rows: Sequence[Sparse], count: int) -> list[Sparse]:
 
 
 def find_groups(rows: Sequence[Sparse], count: int) -> list[int]:
-    """The group of each row: rows of different groups have no column in common, of `count`."""
+    """The group of each row, as small as possible: rows of different groups share none of the `count` columns."""
     places = np.array([(k, len(rows) + i) for k, row in enumerate(rows) for i in row], int).reshape(-1, 2).T
     size = len(rows) + count
     graph = scipy.sparse.coo_array((np.ones(places.shape[1]), tuple(places)), (size, size))

@@ -64,7 +64,7 @@ class Quantity:
 
     @property
     def filling(self) -> Any:
-        """The filling where there is no value: NaN; of whole numbers the least, or greatest, of their type."""
+        """The number where there is no value: NaN; the least signed or greatest unsigned integer; False."""
         kind = self.dtype.kind
         if kind in "fc":
             return self.dtype.type(np.nan)

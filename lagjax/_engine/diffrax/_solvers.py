@@ -188,7 +188,7 @@ class Projected(_Around):
         lost = jax.tree.map(lambda leaf: jnp.where(failed, jnp.nan, leaf), arrays)
         y1, error, dense = eqx.combine(lost, others)
         # `breakdown` is the only code of diffrax that none of its own solvers returns.
-        projection = diffrax.RESULTS.where(failed, diffrax.RESULTS.breakdown, diffrax.RESULTS.successful)
+        projection: Any = diffrax.RESULTS.where(failed, diffrax.RESULTS.breakdown, diffrax.RESULTS.successful)  # type: ignore
         return y1, error, dense, state, diffrax.RESULTS.where(result == diffrax.RESULTS.successful, projection, result)
 
 

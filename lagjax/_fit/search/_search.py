@@ -231,8 +231,10 @@ class _ShortestSegments(NamedTuple):
 
 
 def _last_followed_level(levels_done: list[Descent]) -> int:
-    """The last level from which joining did not lose the motion: what a scene lacks leaves three times more at each
-    join, lost motion ten times."""
+    """The index of the last level whose misfit grew by at most `_WORSE` at each join.
+
+    What a scene lacks triples the misfit at a join, a lost motion makes it ten times as large.
+    """
     good, last = 0, np.inf
     for k, done in enumerate(levels_done):
         now = misfit(done.noise, done.residuals)

@@ -76,7 +76,7 @@ def follow_known(plan: HybridPlan, layout: Layout, params: PyTree, ts, y0, vecto
 def _arrange(
     plan: HybridPlan, layout: Layout, replay: HybridReplay, found: Found, row, played: PlayedModes, inputs: tuple
 ) -> Ending:
-    """The motion as a whole; of what varies with `inputs`, if it is traced."""
+    """The outputs, transitions and result of a motion, from the parts played; in JAX if `inputs` are given."""
     library: Any = jnp if inputs else np
 
     def cut(x):
