@@ -39,7 +39,7 @@ class HeldScene(NamedTuple):
         return self.flat.shapes.names
 
     @property
-    def _rows(self) -> np.ndarray:
+    def _contact_rows(self) -> np.ndarray:
         return np.arange(self.own, self.own + len(self.places))
 
     def split(self, multipliers, layout: Layout, params: PyTree) -> tuple:
@@ -53,10 +53,10 @@ class HeldScene(NamedTuple):
 
     def judge(self, scene: SceneState, q, multipliers, ok) -> tuple:
         """The multipliers (m,) of an equilibrium at q (n,), whether it is one of the contacts, and why it is none."""
-        pushes, jacobian = multipliers[self._rows], scene.jacobian(q, scene.qdot)
+        pushes, jacobian = multipliers[self._contact_rows], scene.jacobian(q, scene.qdot)
         gaps, slopes = _gaps_and_slopes(self.flat, q, scene.params)
         rounding = _UNLOADED * jnp.max(jnp.abs(multipliers), initial=0.0)
-        presses, stays_open = pushes >= -rounding, gaps >= -_CLOSED * _sizes(gaps, slopes, q)
+        presses, stays_open = pushes >= -rounding, gaps >= -_CLOSED * _gap_sizes(gaps, slopes, q)
         fine = jnp.all(presses) & jnp.all(stays_open)
         if not is_concrete(fine) or not ok or fine:
             return multipliers, ok & fine, ""
@@ -68,9 +68,9 @@ class HeldScene(NamedTuple):
             return multipliers, fine, why
         # Of contacts that depend on each other, as the four feet of a table, other shares of the load may press.
         force = np.asarray(scene.force(q, scene.qdot))
-        if (shares := _pressing_shares(np.asarray(jacobian), force, self._rows)) is not None:
+        if (shares := _pressing_shares(np.asarray(jacobian), force, self._contact_rows)) is not None:
             return jnp.asarray(shares, multipliers.dtype), jnp.asarray(True), ""
-        return multipliers, fine, self._opens(pushes, "At the equilibrium that was found")
+        return multipliers, fine, self._explain_opening(pushes, "At the equilibrium that was found")
 
     def require_loaded(self, q: PyTree, qdot: PyTree, params: PyTree, why: str) -> PyTree:
         """q, where all that is held presses; else raise `ValueError`, or, where that is being traced, q as NaN.
@@ -79,17 +79,17 @@ class HeldScene(NamedTuple):
         """
         if not self.places:
             return q
-        leaves = jax.tree.leaves(self.system.multipliers(q, _velocities(q, qdot), 0.0, params))
+        leaves = jax.tree.leaves(self.system.multipliers(q, _allowed_velocities(q, qdot), 0.0, params))
         multipliers = jnp.concatenate([jnp.ravel(x) for x in leaves])
-        pushes = multipliers[self._rows]
+        pushes = multipliers[self._contact_rows]
         loaded = jnp.all(pushes > _UNLOADED * jnp.max(jnp.abs(multipliers)))
         if not is_concrete(loaded):
             return jax.tree.map(lambda x: nan_unless(loaded, jnp.asarray(x, float)), q)
         if not loaded:
-            raise ValueError(f"{self._opens(pushes, 'At this state')} {why}")
+            raise ValueError(f"{self._explain_opening(pushes, 'At this state')} {why}")
         return q
 
-    def _opens(self, pushes, where: str) -> str:
+    def _explain_opening(self, pushes, where: str) -> str:
         k = int(np.argmin(np.asarray(pushes)))
         name = self.names[self.places[k]]
         return (
@@ -119,7 +119,7 @@ def hold_closed(system: Any, q: PyTree, qdot: PyTree, params: PyTree, what: str)
             "closed as constraints=…, whose multipliers they may read there."
         )
     with jax.ensure_compile_time_eval():
-        rest = _velocities(q, qdot)
+        rest = _allowed_velocities(q, qdot)
         layout = Layout.from_state(q, rest)
         flat = Flat.from_system(system, layout, params)
         at, rate = layout.flatten(q), layout.flatten(rest)
@@ -131,7 +131,7 @@ def hold_closed(system: Any, q: PyTree, qdot: PyTree, params: PyTree, what: str)
             "and jax.vmap, or with a q and gaps in which no number is being traced."
         )
     gaps, rates, at, slopes, rate = map(np.asarray, (gaps, rates, at, slopes, rate))
-    near, slow = _CLOSED * _sizes(gaps, slopes, at), _CLOSED * (np.abs(slopes) @ np.abs(rate))
+    near, slow = _CLOSED * _gap_sizes(gaps, slopes, at), _CLOSED * (np.abs(slopes) @ np.abs(rate))
     for k in np.flatnonzero(gaps < -near):
         name = flat.shapes.names[k]
         raise ValueError(f"{name} = {gaps[k]:.6g} is negative at q, and gaps stay >= 0: begin where none is.")
@@ -143,7 +143,7 @@ def hold_closed(system: Any, q: PyTree, qdot: PyTree, params: PyTree, what: str)
     own = 0 if system.constraints is None else sum(
         leaf.size for leaf in jax.tree.leaves(system._output_shapes("constraints", layout, params))
     )  # fmt: skip
-    return HeldScene(_hold(system, places), system, flat, places, own)
+    return HeldScene(_hold_contacts(system, places), system, flat, places, own)
 
 
 def _pressing_shares(jacobian: np.ndarray, force: np.ndarray, rows: np.ndarray) -> np.ndarray | None:
@@ -158,7 +158,7 @@ def _pressing_shares(jacobian: np.ndarray, force: np.ndarray, rows: np.ndarray) 
     return multipliers
 
 
-def _velocities(q: PyTree, qdot: PyTree) -> PyTree:
+def _allowed_velocities(q: PyTree, qdot: PyTree) -> PyTree:
     return jax.tree.map(lambda x: jnp.zeros_like(jnp.asarray(x, float)), q) if qdot is None else qdot
 
 
@@ -168,7 +168,7 @@ def _gaps_and_slopes(flat: Flat, q, params: PyTree) -> tuple:
     return flat.gaps(q, time, params), jax.jacfwd(flat.gaps)(q, time, params)
 
 
-def _sizes(gaps, slopes, q):
+def _gap_sizes(gaps, slopes, q):
     """The sizes (k,) of what makes gaps; where q is zero that is what rounding leaves of terms of one."""
     return abs(slopes) @ abs(q) + 1e-8 * (1.0 + abs(gaps))
 
@@ -192,7 +192,7 @@ def _drop_contacts(system: System) -> System:
     return replace_functions(system, functions)
 
 
-def _hold(system: System, places: tuple[int, ...]) -> System:
+def _hold_contacts(system: System, places: tuple[int, ...]) -> System:
     """The scene with these gaps among its constraints, and without contacts."""
     bare, own, contacts = _drop_contacts(system), system.constraints, system.contacts
     if not places or contacts is None:

@@ -46,7 +46,7 @@ def _call_numpy(function: Callable, shapes: tuple, *arrays) -> tuple:
     return tuple(jax.lax.platform_dependent(*arrays, cpu=cpu, default=others))
 
 
-def _each(function: Callable, *arrays: np.ndarray) -> list[np.ndarray]:
+def _map_finite(function: Callable, *arrays: np.ndarray) -> list[np.ndarray]:
     """`function` of every matrix of a batch (…, n, n); NaN where they are not finite or LAPACK gives up."""
     batch, results = arrays[0].shape[:-2], []
     for members in zip(*(x.reshape(-1, *x.shape[-2:]) for x in arrays), strict=True):
@@ -70,10 +70,10 @@ def symmetric_modes(stiffness: Matrix, mass: Matrix) -> tuple[Float[Array, " n"]
     """λ (n,), ascending, and X (n, n) with K X = M X Λ, XᵀM X = 1; NaN where M is not positive definite."""
     n = len(mass)
     shapes = jax.ShapeDtypeStruct((n,), mass.dtype), jax.ShapeDtypeStruct((n, n), mass.dtype)
-    return _call_numpy(lambda *x: _each(_symmetric, *x), shapes, stiffness, mass)  # pyright: ignore[reportReturnType]
+    return _call_numpy(lambda *x: _map_finite(_symmetric_modes, *x), shapes, stiffness, mass)  # pyright: ignore[reportReturnType]
 
 
-def _symmetric(stiffness: np.ndarray, mass: np.ndarray) -> list[np.ndarray]:
+def _symmetric_modes(stiffness: np.ndarray, mass: np.ndarray) -> list[np.ndarray]:
     """λ and X of one pair; the last step, a Rayleigh quotient each, makes small eigenvalues as exact as K allows."""
     stiffness, mass = 0.5 * (stiffness + stiffness.T), 0.5 * (mass + mass.T)
     lower = np.linalg.inv(np.linalg.cholesky(mass))
@@ -85,15 +85,15 @@ def _symmetric(stiffness: np.ndarray, mass: np.ndarray) -> list[np.ndarray]:
 
 
 @symmetric_modes.defjvp
-def _symmetric_jvp(primals, tangents):
+def _symmetric_modes_jvp(primals, tangents):
     values, vectors = symmetric_modes(*primals)
     by_stiffness, by_mass = (vectors.T @ (0.5 * (x + x.T)) @ vectors for x in tangents)
     change = by_stiffness - by_mass * values  # xᵢᵀ (dK − λⱼ dM) xⱼ
     turns = change * _inverse_gaps(values) * (1 - jnp.eye(len(values), dtype=values.dtype))
-    return (values, vectors), (jnp.diagonal(change), vectors @ jnp.where(_meet(values), -0.5 * by_mass, turns))
+    return (values, vectors), (jnp.diagonal(change), vectors @ jnp.where(_equal_pairs(values), -0.5 * by_mass, turns))
 
 
-def _meet(values) -> Array:
+def _equal_pairs(values) -> Array:
     """True for each pair of eigenvalues that count as equal, (n, n), each with itself."""
     values = jax.lax.stop_gradient(values)
     size = jnp.max(jnp.abs(values))
@@ -103,7 +103,7 @@ def _meet(values) -> Array:
 
 def _inverse_gaps(values) -> Array:
     """1/(λⱼ − λᵢ), (n, n), and zero where the two meet."""
-    same = _meet(values)
+    same = _equal_pairs(values)
     return jnp.where(same, 0, 1 / jnp.where(same, 1, values - values[:, None]))
 
 
@@ -117,15 +117,15 @@ def exponents_and_modes(matrix: Float[Array, "2n 2n"]) -> tuple[Array, Array]:
     smallest and so on, of which the larger is among the first. Those are sorted by Im s, growing ones first; the last n
     are their partners. Derivatives are NaN where there is no basis of eigenvectors.
     """
-    return _eigen(matrix)[:2]
+    return _decompose(matrix)[:2]
 
 
 @jax.custom_jvp
-def _eigen(matrix: Array) -> tuple[Array, Array, Array]:
+def _decompose(matrix: Array) -> tuple[Array, Array, Array]:
     """s, X and X⁻¹."""
     n, dtype = len(matrix), jnp.result_type(matrix, jnp.complex64)
     shapes = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in ((n,), (n, n), (n, n)))
-    return _call_numpy(lambda a: _each(_general, a), shapes, matrix)  # pyright: ignore[reportReturnType]
+    return _call_numpy(lambda a: _map_finite(_general, a), shapes, matrix)  # pyright: ignore[reportReturnType]
 
 
 # A basis of eigenvectors that has lost half of the digits is none: rounding splits a Jordan block of two by √eps.
@@ -153,9 +153,9 @@ def _eigenvalue_order(values: np.ndarray) -> np.ndarray:
     return np.concatenate([real[:half], upper, real[::-1][:half], upper + 1])
 
 
-@_eigen.defjvp
-def _eigen_jvp(primals, tangents):
-    values, vectors, inverse = _eigen(*primals)
+@_decompose.defjvp
+def _decompose_jvp(primals, tangents):
+    values, vectors, inverse = _decompose(*primals)
     change = inverse @ tangents[0].astype(values.dtype) @ vectors
     turns = change * _inverse_gaps(values)
     return (values, vectors, inverse), (jnp.diagonal(change), vectors @ turns, -turns @ inverse)
@@ -170,7 +170,7 @@ def _null_space(rows: Float[Array, "m n"], rank: int) -> Float[Array, "n n-rank"
     lengths = jnp.linalg.norm(rows, axis=1, keepdims=True)
     unit = jax.lax.stop_gradient(rows / jnp.where(lengths > 0, lengths, 1))
     shape = (jax.ShapeDtypeStruct((n, n - rank), rows.dtype),)
-    return _call_numpy(lambda g: _each(lambda a: [decide(a).right[:, rank:]], g), shape, unit)[0]
+    return _call_numpy(lambda g: _map_finite(lambda a: [decide(a).right[:, rank:]], g), shape, unit)[0]
 
 
 def tangent_basis(jacobian: Float[Array, "m n"], rank: int) -> Float[Array, "n n-rank"]:

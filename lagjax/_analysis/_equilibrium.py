@@ -125,13 +125,13 @@ def equilibrium(
     scene = SceneState.from_state(system if held is None else held.system, q, qdot, params, sparse=True)
     scene.require_autonomous("An equilibrium")
     if scene.large:
-        place, multipliers, ok, why = _solve_large(scene, qdot, stable)
+        place, multipliers, ok, why = _solve_large_balance(scene, qdot, stable)
     else:
         require_steady(scene)
         if stable:
             scene = _settled_scene(scene, qdot)
         place, _, multipliers, ok = find_balance(scene, None)
-        why = "" if not throw or not scene.concrete or ok else _sentence(scene)
+        why = "" if not throw or not scene.concrete or ok else _explain_no_equilibrium(scene)
     if held is not None and why:
         why += " What rests on a contact is sought from where it is closed: begin at a q with a gap of zero."
     elif held is not None:
@@ -164,7 +164,7 @@ def _settled_scene(scene: SceneState, qdot: PyTree) -> SceneState:
             "stable=True follows a motion until it rests, and cannot be traced: find q outside of jit, vmap and grad, "
             "and give it to equilibrium(system, q, params) inside; derivatives by params are right there."
         )
-    return SceneState.from_state(scene.system, _settle(scene), None, scene.params)
+    return SceneState.from_state(scene.system, _settled_position(scene), None, scene.params)
 
 
 def require_steady(scene: SceneState) -> None:
@@ -193,7 +193,7 @@ _STAGES, _TIMES, _AT_REST = 16, 20.0, 1e-4
 _RTOL = 1e-6
 
 
-def _settle(scene: SceneState) -> PyTree:
+def _settled_position(scene: SceneState) -> PyTree:
     """q where the scene comes to rest with friction, in the user's pytree. Raises `ValueError` where it does not."""
     scales, layout = scene.scales, scene.layout
     # Links between neighbours are short beside a large scene.
@@ -294,7 +294,7 @@ def _solve_balance(has_terms: bool, steady: Steady | None, *arguments) -> tuple[
     given = scene.q if steady is None else jnp.where(steady.cyclic, scene.qdot, scene.q)
     start = jax.lax.stop_gradient(jnp.concatenate([given, multipliers_at(*state_of(given))]))
     mass = jax.lax.stop_gradient(scene.mass_matrix(scene.q, scene.qdot))
-    unit = _units(mass, jax.jacfwd(residual)(start), True if steady is None else ~steady.cyclic)
+    unit = _number_units(mass, jax.jacfwd(residual)(start), True if steady is None else ~steady.cyclic)
     least = jnp.abs(start).at[n:].max(_TINY * unit[n:] * jnp.max(jnp.abs(start / unit)[n:], initial=0.0))
 
     def find(_, start):
@@ -312,7 +312,7 @@ def _solve_balance(has_terms: bool, steady: Steady | None, *arguments) -> tuple[
     return nan_unless(ok, q), nan_unless(ok, qdot), nan_unless(ok, multipliers_at(q, qdot)), ok
 
 
-def _units(mass: Float[Array, "n n"], jacobian: Float[Array, "n+m n+m"], places: Any) -> Unknowns:
+def _number_units(mass: Float[Array, "n n"], jacobian: Float[Array, "n+m n+m"], places: Any) -> Unknowns:
     """A unit of each number of z, alike in all units of a user: 1/√Mᵢᵢ for qᵢ, which are `places`, for velocities and λ
     what makes as much of forces."""
     inertia, n = jnp.abs(jnp.diagonal(mass)), len(mass)
@@ -340,7 +340,7 @@ def least_multipliers(jacobian: Float[Array, "m n"], force: Vector) -> Array:
 # ---- large scenes ----------------------------------------------------------------------------------------------------
 
 
-def _solve_large(scene: SceneState, qdot: PyTree, stable: bool) -> tuple[Vector, Array, Bool[Array, ""], str]:
+def _solve_large_balance(scene: SceneState, qdot: PyTree, stable: bool) -> tuple[Vector, Array, Bool[Array, ""], str]:
     """q (n,), λ (m,), whether they are an equilibrium, and why not."""
     n, state = scene.layout.size, (scene.q, scene.qdot, jnp.zeros((), scene.q.dtype), scene.numbers)
     if qdot is not None:
@@ -358,14 +358,14 @@ def _solve_large(scene: SceneState, qdot: PyTree, stable: bool) -> tuple[Vector,
     least[n:] = np.maximum(least[n:], _TINY * unit[n:] * (least / unit)[n:].max(initial=0))
     z = descend(of.residual, of.jacobian, start, least, unit)
     z = np.where(np.abs(z) < np.finfo(float).eps ** 3 * np.abs(start), 0.0, z)
-    why = "" if is_balanced(of, z, least) else _sentence(scene, jacobian)
+    why = "" if is_balanced(of, z, least) else _explain_no_equilibrium(scene, jacobian)
     if not why and stable and falls(of, z, unit[:n]):
         why = "With friction the scene came to rest where it does not stay: at a saddle. Begin farther from it."
     ok = jnp.asarray(not why)
     return nan_unless(ok, jnp.asarray(z[:n])), nan_unless(ok, jnp.asarray(z[n:])), ok, why
 
 
-def _sentence(scene: SceneState, gradient: Sparse | None = None) -> str:
+def _explain_no_equilibrium(scene: SceneState, gradient: Sparse | None = None) -> str:
     """The reason why no equilibrium is found; a large scene has the sparse `gradient` of forces at the guess."""
     force, names = np.asarray(scene.force(scene.q, scene.qdot)), scene.layout.names
     if gradient is None:

@@ -40,7 +40,7 @@ class Changes(NamedTuple):
 
 def changes_of(scene: SceneState, fields: Fields, weights: np.ndarray, states: FlatState) -> tuple[Changes, FlatState]:
     """The changes of L by transformations with weights (D, K), at states where they are finite, and these states."""
-    parts = [np.asarray(x) for x in _changes(jnp.asarray(weights), fields, states, *scene.arguments)]
+    parts = [np.asarray(x) for x in _changes_at_states(jnp.asarray(weights), fields, states, *scene.arguments)]
     well = np.logical_and.reduce([np.isfinite(x).all(axis=tuple(range(1, x.ndim))) for x in parts])
     if not well.any():
         raise ValueError(
@@ -57,7 +57,7 @@ def gauge_of(scene: SceneState, fields: Fields, weights: np.ndarray, k: int, cha
     if np.abs(values).max() <= _ZERO * size:
         return None
     spread = np.ptp(slopes, axis=0).max() <= _ZERO * (np.abs(slopes).max() + size)
-    return _function(scene, fields, weights, bool(spread and np.abs(at_rest).max() <= _ZERO * size))
+    return _gauge_function(scene, fields, weights, bool(spread and np.abs(at_rest).max() <= _ZERO * size))
 
 
 def is_right(gauge: Callable, scene: SceneState, fields: Fields, k: int, changes: Changes, states: FlatState) -> bool:
@@ -75,7 +75,7 @@ def is_right(gauge: Callable, scene: SceneState, fields: Fields, k: int, changes
     return all(np.abs(x - of[some, k]).max() <= _RIGHT * np.abs(of[:, k]).max() + allowed for x, of in pairs)
 
 
-def _function(scene: SceneState, fields: Fields, weights: np.ndarray, constant: bool) -> Callable:
+def _gauge_function(scene: SceneState, fields: Fields, weights: np.ndarray, constant: bool) -> Callable:
     layout, system, reference = scene.layout, scene.system, np.asarray(scene.q)
 
     @accepts_singles(("q",), ("t", "params"))
@@ -100,16 +100,16 @@ def _function(scene: SceneState, fields: Fields, weights: np.ndarray, constant: 
 
 
 @compile_for_one_call
-def _changes(weights: Array, fields: Fields, states: FlatState, *arguments) -> tuple:
+def _changes_at_states(weights: Array, fields: Fields, states: FlatState, *arguments) -> tuple:
     scene = SceneState.from_arguments(*arguments)
 
     def changes_at(state):
-        return jax.lax.map(lambda w: _change(scene, fields, fields.transform(w, scene.params), state), weights)
+        return jax.lax.map(lambda w: _change_at_state(scene, fields, fields.transform(w, scene.params), state), weights)
 
     return jax.lax.map(changes_at, states)
 
 
-def _change(scene: SceneState, fields: Fields, transform: Callable, state: FlatState) -> tuple:
+def _change_at_state(scene: SceneState, fields: Fields, transform: Callable, state: FlatState) -> tuple:
     """The fields of `Changes` of one transformation at one state."""
     q, qdot, t = state.q, state.qdot, state.t
 

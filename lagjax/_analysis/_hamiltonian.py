@@ -88,13 +88,13 @@ def hamiltonian(system: System) -> Hamiltonian:
         raise ValueError("hamiltonian takes systems without constraints: give L in coordinates that satisfy them.")
 
     def velocity(q, p, t: Any = 0.0, params=None):
-        return _transform(system, q, p, t, params)[0]
+        return _hamiltonian_equations(system, q, p, t, params)[0]
 
     def energy(q, p, t=0.0, params=None):
-        return _transform(system, q, p, t, params)[2]
+        return _hamiltonian_equations(system, q, p, t, params)[2]
 
     def equations(q, p, t=0.0, params=None):
-        return _transform(system, q, p, t, params)[:2]
+        return _hamiltonian_equations(system, q, p, t, params)[:2]
 
     def run(q0, p0, ts, params=None, **options):
         done = simulate(system, q0, velocity(q0, p0, jnp.asarray(ts)[0], params), ts, params, **options)
@@ -104,16 +104,16 @@ def hamiltonian(system: System) -> Hamiltonian:
     return Hamiltonian(system, energy, system.momentum, velocity, equations, run)
 
 
-def _transform(system: System, q: PyTree, p: PyTree, t, params: PyTree) -> tuple[PyTree, PyTree, Array]:
+def _hamiltonian_equations(system: System, q: PyTree, p: PyTree, t, params: PyTree) -> tuple[PyTree, PyTree, Array]:
     """q̇ and ṗ, in the structure of q, and H."""
     system, layout = present_system(system), Layout.from_state(q, p)
     flat = layout.flatten(q), layout.flatten(p), as_arrays(params, layout.dtype)
-    v, force, energy = _transform_flat(jnp.asarray(t, layout.dtype), system, layout, *flat)
+    v, force, energy = _flat_hamiltonian_equations(jnp.asarray(t, layout.dtype), system, layout, *flat)
     return layout.restore(v), layout.restore(force), energy
 
 
 @compile_for_one_call
-def _transform_flat(t, *arguments) -> tuple[Vector, Vector, Array]:
+def _flat_hamiltonian_equations(t, *arguments) -> tuple[Vector, Vector, Array]:
     """q̇ = v with ∂L/∂q̇(q, v, t) = p, by Newton's method from rest, ṗ and H; p is in the place of q̇."""
     scene = SceneState.from_arguments(*arguments)
     motion, q, p = scene.motion, scene.q, scene.qdot

@@ -118,19 +118,19 @@ class Linearization(NamedTuple):
         n, a, rows = len(self.names), self.A, self.allowed
         if motion is not None:
             layout = Layout.from_state(motion.q, motion.qdot)
-            a, rows = _remove_symmetries(a, rows, layout.flatten(motion.qdot), motion.moves, motion.turns)
+            a, rows = _co_rotating_frame(a, rows, layout.flatten(motion.qdot), motion.moves, motion.turns)
             cyclic = np.concatenate([np.ravel(x) for x in jax.tree.leaves(motion.cyclic)])
             rows = rows[np.append(np.ones(len(self.allowed), bool), cyclic)]
         rank = 2 * n - null_space(np.asarray(rows)).shape[1] if is_known(rows) else len(rows)
-        return ReducedLinearization._make(_reduce(rank, rows, a, self.B, self.C, self.D, self.sampled))
+        return ReducedLinearization._make(_reduced_fields(rank, rows, a, self.B, self.C, self.D, self.sampled))
 
     def __str__(self) -> str:
         if not is_known(self.A) or np.ndim(self.A) != 2:
             return f"Linearization: A {np.shape(self.A)}, B {np.shape(self.B)}, C {np.shape(self.C)}"
         n, of = len(self.names), [*self.names.states, *self.names.inputs]
-        lines = _equations([f"δ{name}''" for name in self.names], np.hstack([self.A, self.B])[n:], of)
+        lines = _equation_lines([f"δ{name}''" for name in self.names], np.hstack([self.A, self.B])[n:], of)
         if self.names.outputs != self.names.states:
-            lines += _equations([f"δ{name}" for name in self.names.outputs], np.hstack([self.C, self.D]), of)
+            lines += _equation_lines([f"δ{name}" for name in self.names.outputs], np.hstack([self.C, self.D]), of)
         return "\n".join(lines)
 
 
@@ -162,7 +162,7 @@ class ReducedLinearization(NamedTuple):
 
 
 @compile_for_one_call
-def _remove_symmetries(a: Array, rows: Array, qdot: Vector, moves: Array, turns: Array) -> tuple[Array, Array]:
+def _co_rotating_frame(a: Array, rows: Array, qdot: Vector, moves: Array, turns: Array) -> tuple[Array, Array]:
     """A in a frame that turns with a steady motion, and rows (k + n, 2n) whose last ones, one for each coordinate that
     is cyclic, are zero for what is orthogonal to a deviation along it."""
     spin = jnp.einsum("i,ijk", qdot, turns.astype(a.dtype))
@@ -171,7 +171,7 @@ def _remove_symmetries(a: Array, rows: Array, qdot: Vector, moves: Array, turns:
 
 
 @compile_for_one_call
-def _reduce(rank: int, rows: Array, a: Array, b: Array, c: Array, d: Array, sampled: tuple | None) -> tuple:
+def _reduced_fields(rank: int, rows: Array, a: Array, b: Array, c: Array, d: Array, sampled: tuple | None) -> tuple:
     """The fields of a `ReducedLinearization` to what the `rows`, of this rank, send to zero."""
     basis = tangent_basis(rows, rank)
     inverse = factorize(basis.T @ basis).solve_columns(basis.T)  # orthonormal columns, but for derivatives
@@ -179,7 +179,7 @@ def _reduce(rank: int, rows: Array, a: Array, b: Array, c: Array, d: Array, samp
     return inverse @ a @ basis, inverse @ b, c @ basis, d, basis, phi, gamma
 
 
-def _equations(left: list[str], rows: np.ndarray, of: list[str]) -> list[str]:
+def _equation_lines(left: list[str], rows: np.ndarray, of: list[str]) -> list[str]:
     """Lines such as "δq'' = -1 δq +1 u", of each of the rows (k, l) of factors, and how many more there are.
 
     Rounding is left out: what is a few units in the last place of the largest factor of its row and its column.

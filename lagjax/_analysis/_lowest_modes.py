@@ -63,7 +63,7 @@ def lowest_modes(
                 f"The {rows} constraints depend on each other at q, or nearly: of large scenes modes are found "
                 "with independent ones. Drop those that follow from others."
             )
-    counted = [] if rows else _slices(stiffness, mass, shift, factors, count)
+    counted = [] if rows else _slice_spectrum(stiffness, mass, shift, factors, count)
     values, shapes = np.zeros(0), np.zeros((n, 0))
     try:
         for of_slice in counted or slices:
@@ -80,14 +80,14 @@ def lowest_modes(
         raise ValueError(f"The {count} lowest modes were not found: {error}. Ask for fewer.") from None
     values, shapes = _rayleigh_ritz(stiffness, mass, shapes)
     values, shapes, factors = values[:count], shapes[:, :count], slices[0][1]
-    again = np.column_stack([_invert(factors, x) for x in (mass @ shapes).T]) * (values - shift)
+    again = np.column_stack([_solve_shifted(factors, x) for x in (mass @ shapes).T]) * (values - shift)
     off = np.linalg.norm(again - shapes, axis=0) / np.linalg.norm(shapes, axis=0)
     if not off.max() <= _OFF:
         raise ValueError(f"Mode {np.argmax(off)} was not found: its shape is off by {off.max():.1g} of its length.")
     return values, shapes
 
 
-def _invert(factors: SuperLU, b: np.ndarray) -> np.ndarray:
+def _solve_shifted(factors: SuperLU, b: np.ndarray) -> np.ndarray:
     """x (n,) of (K − σM) x = b, by factors that may be bordered by constraints."""
     return factors.solve(np.append(b, np.zeros(factors.shape[0] - len(b))))[: len(b)]
 
@@ -97,7 +97,7 @@ def _modes_of(stiffness: Sparse, mass: Sparse, against: np.ndarray, shift: float
     n, weighted = len(against), mass @ against
 
     def project_inverse(b):
-        x = _invert(factors, b - weighted @ (against.T @ b))
+        x = _solve_shifted(factors, b - weighted @ (against.T @ b))
         return x - against @ (weighted.T @ x)
 
     start = project_inverse(mass @ np.random.default_rng(0).normal(size=n))
@@ -105,7 +105,7 @@ def _modes_of(stiffness: Sparse, mass: Sparse, against: np.ndarray, shift: float
     return eigsh(stiffness, modes, mass, shift, which, start, OPinv=inverse)  # pyright: ignore
 
 
-def _slices(
+def _slice_spectrum(
     stiffness: Sparse, mass: Sparse, low: float, factors: SuperLU, count: int
 ) -> list[tuple[float, Any, int, str]]:
     """Shifts, factors and numbers of modes that together are the lowest `count` to twice as many; none if not found. A
@@ -114,7 +114,7 @@ def _slices(
     far, high, width = (low, factors, 0, "LM"), np.inf, 4 * _SHIFT * (float(abs(stiffness).sum(axis=1).max()) or 1.0)
     for _ in range(2 * _TRIALS):
         trial = low + width if np.isinf(high) else 0.5 * (low + high)
-        if (found := _eliminate(stiffness - trial * mass)) is None:
+        if (found := _factor_symmetric(stiffness - trial * mass)) is None:
             return []
         below = int(np.sum(found.U.diagonal() < 0))
         if count <= below <= 2 * count:
@@ -127,7 +127,7 @@ def _slices(
     return []
 
 
-def _eliminate(matrix: Sparse) -> SuperLU | None:
+def _factor_symmetric(matrix: Sparse) -> SuperLU | None:
     """The factors of a symmetric matrix without pivoting; None where that meets a zero."""
     options = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
     try:
@@ -171,7 +171,7 @@ def lowest_shift(stiffness: Sparse, mass: Sparse, jacobian: Sparse = None) -> tu
 
 def factorize_positive(matrix: Sparse) -> SuperLU | None:
     """The factors of a positive definite matrix, by elimination without pivoting; None where it is none."""
-    factors = _eliminate(matrix)
+    factors = _factor_symmetric(matrix)
     return factors if factors is not None and (factors.U.diagonal() > 0).all() else None
 
 

@@ -68,13 +68,13 @@ class Modes(eqx.Module):
         rows = [f"{'mode':>4} {'frequency':>14} {'damping ratio':>14}  "]
         for k, (frequency, pair) in enumerate(zip(frequencies, exponents, strict=True)):
             ratio = float(np.asarray(self.damping_ratios)[k])
-            rows.append(f"{k:4d} {frequency:14.8g} {ratio:14.4g}  {_kind(pair, size)}")
+            rows.append(f"{k:4d} {frequency:14.8g} {ratio:14.4g}  {_mode_kind(pair, size)}")
         rows.append("stable" if self.stable else "unstable")
         return "\n".join(row.rstrip() for row in rows)
 
 
-def _kind(pair: np.ndarray, size: float) -> str:
-    small, real, imaginary = _grows_beyond(size), np.real(pair), np.imag(pair)
+def _mode_kind(pair: np.ndarray, size: float) -> str:
+    small, real, imaginary = _growth_threshold(size), np.real(pair), np.imag(pair)
     if np.abs(pair).max() <= small:
         return "zero mode: neutral, may drift"
     if real.max() > small:
@@ -84,7 +84,7 @@ def _kind(pair: np.ndarray, size: float) -> str:
     return "decays" if real.max() < -small else "decays to a neutral position"
 
 
-def _grows_beyond(size):
+def _growth_threshold(size):
     """The real part that counts as growth: rounding splits a double zero by √eps of the largest exponent, or more."""
     return 7 * float(np.finfo(size.dtype).eps) ** 0.5 * size
 
@@ -140,9 +140,9 @@ def normal_modes(
     else:
         require_steady(scene)
         require_smooth(scene, "A normal mode")
-        cyclic, rank = scene.conserved, _rank(scene)
+        cyclic, rank = scene.conserved, _count_independent_constraints(scene)
         reversible = scene.reversible and qdot is None
-        modes, residual = _modes(cyclic, rank, reversible, *scene.arguments)
+        modes, residual = _dense_modes(cyclic, rank, reversible, *scene.arguments)
     if scene.concrete and not residual <= _BALANCED:
         made = f" that a deviation of {float(residual):.2g} of q's size would make" if np.isfinite(residual) else ""
         raise ValueError(
@@ -161,7 +161,7 @@ def normal_modes(
 _BALANCED = 1e-6
 
 
-def _rank(scene: SceneState) -> int:
+def _count_independent_constraints(scene: SceneState) -> int:
     """The number of independent constraints at q; all of them where there are no numbers to ask."""
     if not scene.constrained:
         return 0
@@ -178,7 +178,7 @@ def _rank(scene: SceneState) -> int:
 
 
 @compile_for_one_call
-def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> tuple:
+def _dense_modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> tuple:
     """The modes of the k degrees of freedom, and how far q is from an equilibrium."""
     scene = SceneState.from_arguments(*arguments)
     q, matrices = scene.q, steady_matrices(scene, scene.q)
@@ -189,8 +189,8 @@ def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> 
     rows = scene.motion.constraints.residual(q, scene.qdot, jnp.zeros((), q.dtype), scene.numbers)
     force = None if scene.constrained else lambda place: scene.force(unit * place, scene.qdot) * unit
     values = jnp.concatenate([matrices[4] * unit, rows])
-    residual = jax.lax.stop_gradient(_distance(values, slopes, q / unit, stiffness, shortest_solution, force))
-    residual = residual + jnp.where(_rank_is(jacobian, rank), 0, jnp.nan)
+    residual = jax.lax.stop_gradient(_imbalance(values, slopes, q / unit, stiffness, shortest_solution, force))
+    residual = residual + jnp.where(_has_rank(jacobian, rank), 0, jnp.nan)
     gone, keep = np.array(cyclic, int), np.setdiff1d(np.arange(len(q)), cyclic)
     reduced, follow = _eliminate_cyclic(mass, rates, stiffness, keep, gone)
     basis = tangent_basis(jacobian[:, keep], rank)
@@ -206,20 +206,20 @@ def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> 
         exponents = jnp.concatenate([jnp.zeros((len(gone), 2), exponents.dtype), exponents])
         shapes = jnp.concatenate([own, shapes])
     balanced = (residual <= _BALANCED) & is_smooth(scene)
-    return _restore(scene.layout, exponents, shapes, shapes @ mass.T.astype(shapes.dtype), unit, balanced), residual
+    return _build_modes(scene.layout, exponents, shapes, shapes @ mass.T.astype(shapes.dtype), unit, balanced), residual
 
 
 @compile_for_one_call
-def _restore(layout: Layout, exponents: Array, shapes: Array, weighted: Array, unit: Vector, balanced) -> Modes:
+def _build_modes(layout: Layout, exponents: Array, shapes: Array, weighted: Array, unit: Vector, balanced) -> Modes:
     """The modes of exponents (k, 2) and shapes x (k, n) in the `unit` (n,) of coordinates, `weighted` their M x (k, n);
     NaN if not `balanced`."""
-    shapes = _normalise(shapes, weighted)
+    shapes = _normalise_shapes(shapes, weighted)
     order = jnp.argsort(jax.lax.stop_gradient(exponents[:, 0].imag), stable=True)
     shapes = shapes[order] * unit
     exponents = jax.lax.complex(*(nan_unless(balanced, x) for x in (exponents.real, exponents.imag)))[order]
     shapes = layout.restore(jnp.where(balanced, shapes, jnp.nan))
     size = jnp.max(jnp.abs(exponents), initial=0)
-    stable = jnp.all(exponents.real <= _grows_beyond(size)) & jnp.all(jnp.isfinite(exponents))
+    stable = jnp.all(exponents.real <= _growth_threshold(size)) & jnp.all(jnp.isfinite(exponents))
     first = exponents[:, 0]
     ratios = jnp.where(first.real == 0, 0, -first.real / jnp.abs(jnp.where(first == 0, 1, first)))
     return Modes(first.imag, shapes, stable, exponents, ratios)
@@ -239,7 +239,7 @@ def _large_modes(scene: SceneState, qdot: PyTree, count: int | None) -> tuple[Mo
         raise ValueError(f"Modes about a steady motion of {n} coordinates are not tried: leave qdot out.")
     of = balance_of(scene, "A normal mode")
     z, x = np.concatenate([scene.q, of.multipliers]), np.random.default_rng(0).normal(size=n)
-    entries, unit, rate = map(np.asarray, _mass_and_rate(motion, jnp.asarray(x), *state))
+    entries, unit, rate = map(np.asarray, _scaled_mass_and_damping(motion, jnp.asarray(x), *state))
     form = cast(Any, motion).structure.mass
     scale, whole = diags_array(unit), of.jacobian(z)
     mass = scale @ csr_array((entries, (form.rows, form.columns))) @ scale
@@ -255,14 +255,14 @@ def _large_modes(scene: SceneState, qdot: PyTree, count: int | None) -> tuple[Mo
     values, units = of.residual(z), np.append(unit, np.ones(len(z) - n))
     force = None if scene.constrained else lambda place: unit * of.residual(unit * place)
     solve = lambda _, b: lowest_shift(stiffness, mass)[1].solve(b)  # noqa: E731
-    residual = _distance(units * values, slopes, scene.q / unit, stiffness, solve, force)
+    residual = _imbalance(units * values, slopes, scene.q / unit, stiffness, solve, force)
     squares, shapes = lowest_modes(stiffness, mass, jacobian, count)
-    exponents = _exponents(squares, _UNITS * n**0.5 * np.finfo(float).eps * size)
-    return _restore(scene.layout, exponents, shapes.T, (mass @ shapes).T, unit, residual <= _BALANCED), residual
+    exponents = _exponents_of_squares(squares, _UNITS * n**0.5 * np.finfo(float).eps * size)
+    return _build_modes(scene.layout, exponents, shapes.T, (mass @ shapes).T, unit, residual <= _BALANCED), residual
 
 
 @compile_for_one_call
-def _mass_and_rate(motion: SparseMotion, x: Vector, *state) -> tuple[Array, Vector, Vector]:
+def _scaled_mass_and_damping(motion: SparseMotion, x: Vector, *state) -> tuple[Array, Vector, Vector]:
     """The entries of M, the unit (n,) of each coordinate, and ∂F/∂q̇ x in these units."""
     (q, qdot, t, numbers), form = state, cast(Any, motion.structure.mass)
     entries, unit = form.read(motion.mass_product(*state), q.dtype), motion.unit(*state)
@@ -273,7 +273,7 @@ def _mass_and_rate(motion: SparseMotion, x: Vector, *state) -> tuple[Array, Vect
 _MOST_MODES = 2000
 
 
-def _rank_is(jacobian: Float[Array, "m n"], rank: int) -> Bool[Array, ""]:
+def _has_rank(jacobian: Float[Array, "m n"], rank: int) -> Bool[Array, ""]:
     if not len(jacobian):
         return jnp.asarray(True)
     lengths = jnp.sqrt(jnp.sum(jacobian**2, axis=1, keepdims=True))
@@ -281,7 +281,7 @@ def _rank_is(jacobian: Float[Array, "m n"], rank: int) -> Bool[Array, ""]:
     return rank_of(unit @ unit.T) == rank
 
 
-def _distance(values: Any, slopes: Any, place: Any, stiffness: Any, solve: Callable, force: Callable | None):
+def _imbalance(values: Any, slopes: Any, place: Any, stiffness: Any, solve: Callable, force: Callable | None):
     """The distance of q from an equilibrium, in units of its size, by `values` (n + m,) of forces and constraints, in
     the unit of each coordinate; q is the `place`, `slopes` (n + m,) the lengths of the rows of K and J, `solve(K, b)` a
     solution of K x = b. Zero also where without constraints the `force` is linear up to a thousand times as far: no
@@ -338,11 +338,11 @@ def _reversible_modes(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[A
     size = jnp.max(jnp.abs(squares))
     zero = _UNITS * len(mass) * jnp.finfo(size.dtype).eps * jax.lax.stop_gradient(size)
     ignored = jnp.max(jnp.abs(shapes.T @ rates @ shapes)) <= jnp.finfo(size.dtype).eps ** 0.6 * jnp.sqrt(size)
-    return _exponents(squares, zero, ignored), shapes
+    return _exponents_of_squares(squares, zero, ignored), shapes
 
 
 @compile_for_one_call
-def _exponents(squares: Array, zero, ok=True) -> Array:
+def _exponents_of_squares(squares: Array, zero, ok=True) -> Array:
     """s = iω, −iω, or κ, −κ, (k, 2), of the squares ω² (k,), of which those up to `zero` are none; NaN if not `ok`."""
     rate = jnp.sqrt(jnp.where(jnp.abs(squares) > zero, jnp.abs(squares), 1))
     frequency, growth = jnp.where(squares > zero, rate, 0), jnp.where(squares < -zero, rate, 0)
@@ -361,7 +361,7 @@ def _general_modes(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Arra
     return jnp.stack([values[:k], values[k:]], axis=1), vectors[:k, :k]
 
 
-def _normalise(shapes: Array, weighted: Array) -> Array:
+def _normalise_shapes(shapes: Array, weighted: Array) -> Array:
     """Shapes x (k, n) with xᴴM x = 1 and the largest entry positive; `weighted` (k, n) are the M x."""
     shapes = shapes / jnp.sqrt(jnp.sum(shapes.conj() * weighted, axis=1, keepdims=True).real).astype(shapes.dtype)
     sizes = jnp.abs(jax.lax.stop_gradient(shapes))

@@ -99,9 +99,9 @@ def flat_generator(generator: Function, layout: Layout) -> Callable:
 
     def flat(q, t, params):
         value = generator(layout.restore(q), t=t, params=params)
-        if _is_like(value, layout):
+        if _fits_state(value, layout):
             return layout.flatten(value), jnp.zeros((), layout.dtype)
-        if isinstance(value, tuple) and len(value) == 2 and _is_like(value[0], layout) and jnp.ndim(value[1]) == 0:
+        if isinstance(value, tuple) and len(value) == 2 and _fits_state(value[0], layout) and jnp.ndim(value[1]) == 0:
             return layout.flatten(value[0]), jnp.asarray(value[1], layout.dtype)
         got = jax.tree.map(jnp.shape, value)
         raise TypeError(
@@ -113,7 +113,7 @@ def flat_generator(generator: Function, layout: Layout) -> Callable:
     return flat
 
 
-def _is_like(value: PyTree, layout: Layout) -> bool:
+def _fits_state(value: PyTree, layout: Layout) -> bool:
     leaves, tree = jax.tree.flatten(value)
     return tree == layout.tree and tuple(jnp.shape(leaf) for leaf in leaves) == layout.shapes
 

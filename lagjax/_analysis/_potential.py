@@ -91,7 +91,7 @@ def absorb_potential_forces(scene: SceneState, scales: Scales, states: FlatState
 
 
 def _have_potential(scene: SceneState, scales: Scales, states: FlatState) -> bool:
-    terms = [np.asarray(x) for x in _derivatives(states, *scene.arguments)]
+    terms = [np.asarray(x) for x in _force_and_slopes(states, *scene.arguments)]
     well = np.logical_and.reduce([np.isfinite(x).all(axis=tuple(range(1, x.ndim))) for x in terms])
     if not well.any():
         return False
@@ -103,7 +103,7 @@ def _have_potential(scene: SceneState, scales: Scales, states: FlatState) -> boo
 
 
 @compile_for_one_call
-def _derivatives(states: FlatState, *arguments) -> tuple[Array, Array, Array]:
+def _force_and_slopes(states: FlatState, *arguments) -> tuple[Array, Array, Array]:
     """Q (S, n), ∂Q/∂q and ∂Q/∂q̇ (S, n, n)."""
     scene = SceneState.from_arguments(*arguments)
 

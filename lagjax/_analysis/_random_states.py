@@ -26,12 +26,12 @@ def random_states(scene: SceneState, scales: Scales, count: int, seed: int, piec
     q = np.asarray(scene.q) + (_FAR if piecewise else 1.0) * _NEAR * beyond * scales.q * draws[0]
     qdot, t = np.asarray(scene.qdot) + _NEAR * scales.qdot * draws[1], scales.t * t
     if scene.constrained:
-        q, qdot = _project(q, qdot, t, scene.system, scene.layout, scene.params)
+        q, qdot = _project_states(q, qdot, t, scene.system, scene.layout, scene.params)
     return FlatState(*(jnp.asarray(x, scene.layout.dtype) for x in (q, qdot, scales.qdot / scales.t * draws[2], t)))
 
 
 @compile_for_one_call
-def _project(q, qdot, t, system, layout, params):
+def _project_states(q, qdot, t, system, layout, params):
     motion, numbers = system._motion(layout, params), eqx.filter(params, eqx.is_array_like)
     return jax.vmap(lambda *y: motion.nearest_consistent(*y, numbers))(q, qdot, t)
 

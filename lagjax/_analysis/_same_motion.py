@@ -97,13 +97,13 @@ def same_motion(a: System, b: System, q: PyTree, qdot: PyTree, params: PyTree = 
     state, coordinate = map(int, np.unravel_index(np.argmax(relative), relative.shape))
     residual = float(relative[state, coordinate])
     same = residual <= threshold and np.isfinite(factor) and factor != 0
-    where = _place(scenes[0].layout, jax.tree.map(np.asarray, states), state, coordinate)
+    where = _transform_point(scenes[0].layout, jax.tree.map(np.asarray, states), state, coordinate)
     return SameMotion(bool(same), factor, residual, threshold, where)
 
 
 def _compare_equations(scenes, states: FlatState) -> tuple[float, np.ndarray, np.ndarray] | None:
     """The factor f, |E_a − f E_b| over its terms (S, n), and which states are finite (S,); None where few are."""
-    (of_a, size_a), (of_b, size_b) = (map(np.asarray, _equations(states, *scene.arguments)) for scene in scenes)
+    (of_a, size_a), (of_b, size_b) = (map(np.asarray, _residuals(states, *scene.arguments)) for scene in scenes)
     well = np.asarray(np.isfinite(of_a).all(axis=1) & np.isfinite(of_b).all(axis=1))
     if well.sum() < _STATES // 4:
         return None
@@ -121,7 +121,7 @@ def _compare_equations(scenes, states: FlatState) -> tuple[float, np.ndarray, np
 
 
 @compile_for_one_call
-def _equations(states: FlatState, *arguments) -> tuple[Array, Array]:
+def _residuals(states: FlatState, *arguments) -> tuple[Array, Array]:
     """E (S, n) and the size of its terms (S, n)."""
     scene = SceneState.from_arguments(*arguments)
 
@@ -136,7 +136,7 @@ def _equations(states: FlatState, *arguments) -> tuple[Array, Array]:
     return jax.lax.map(equation_and_size, states)
 
 
-def _place(layout: Layout, states: FlatState, k: int, coordinate: int) -> str:
+def _transform_point(layout: Layout, states: FlatState, k: int, coordinate: int) -> str:
     def format_values(x):
         return ", ".join(f"{value:.4g}" for value in x[k][:8]) + (", …" if x.shape[1] > 8 else "")
 

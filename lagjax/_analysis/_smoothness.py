@@ -27,7 +27,7 @@ _SLIGHT = 1e-6  # a change of the slope, in units of it, that is a kink and not 
 _ROUNDING = 1e4  # units of rounding of the force one size away; below it a jump is rounding of terms that cancel
 
 
-class _Rough(NamedTuple):
+class _Roughness(NamedTuple):
     """Jumps and kinks of the force along every coordinate, then velocity, and the sides that change there."""
 
     jumps: Bool[Array, " 2n"]
@@ -36,17 +36,17 @@ class _Rough(NamedTuple):
 
 
 def is_smooth(scene: SceneState) -> Bool[Array, ""]:
-    if not _pieces(scene.derivation):
+    if not _function_borders(scene.derivation):
         return jnp.asarray(True)
-    rough = _rough(scene)
+    rough = _measure_roughness(scene)
     return ~jnp.any(rough.jumps | rough.kinks)
 
 
 def require_smooth(scene: SceneState, what: str) -> None:
     """Raise `ValueError` where the force jumps or has a kink at the state, naming the coordinate and the line."""
-    if not scene.concrete or not (pieces := _pieces(scene.derivation)):
+    if not scene.concrete or not (pieces := _function_borders(scene.derivation)):
         return
-    rough = jax.tree.map(np.asarray, _rough(scene))
+    rough = jax.tree.map(np.asarray, _measure_roughness(scene))
     names = (*scene.layout.names, *(f"d{name}" for name in scene.layout.names))
     for k in np.flatnonzero(rough.jumps | rough.kinks).tolist():
         labels = [f"{name}{place}" for name, place, size in pieces for _ in range(size)]
@@ -61,17 +61,17 @@ def require_smooth(scene: SceneState, what: str) -> None:
 
 
 @functools.lru_cache(maxsize=64)
-def _pieces(derivation: Derivation) -> list[tuple[str, str, int]]:
+def _function_borders(derivation: Derivation) -> list[tuple[str, str, int]]:
     """The borders of the functions of a scene: name, place, and how many numbers each compares."""
     return pieces_of_motion(derivation.motion, *derivation.state_shapes)
 
 
-def _state(scene: SceneState) -> tuple:
+def _shifted_state(scene: SceneState) -> tuple:
     return scene.q, scene.qdot, jnp.zeros((), scene.q.dtype), scene.numbers
 
 
-def _rough(scene: SceneState) -> _Rough:
-    q, v, t, numbers = jax.lax.stop_gradient(_state(scene))
+def _measure_roughness(scene: SceneState) -> _Roughness:
+    q, v, t, numbers = jax.lax.stop_gradient(_shifted_state(scene))
     n, eps = len(q), jnp.finfo(q.dtype).eps
 
     def sides(y):
@@ -105,4 +105,4 @@ def _rough(scene: SceneState) -> _Rough:
     jump = is_border & (nearest > _STAYS * near) & (nearest > _ROUNDING * eps * steps(1.0)[2].max())
     bend, nearer = bends(_BESIDE), bends(_BESIDE / 16)
     kink = is_border & ~jump & (nearer > _STAYS * bend) & (nearer > jnp.maximum(_SLIGHT, jnp.sqrt(eps)))
-    return _Rough(jump, kink, changed)
+    return _Roughness(jump, kink, changed)

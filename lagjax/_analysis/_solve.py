@@ -23,7 +23,7 @@ def shortest_solution(matrix: Matrix, b: Vector, unit: Vector | float = 1.0) -> 
     """x of A x = b, the shortest in these units (n,) where pivots of the scaled A say that it is singular. Linear in b,
     with derivatives by both."""
     matrix = matrix * unit
-    rows, columns = (jax.lax.stop_gradient(scale) for scale in _scales(matrix))
+    rows, columns = (jax.lax.stop_gradient(scale) for scale in _equilibration_factors(matrix))
     inverse, order, pivots = invert(jax.lax.stop_gradient(rows[:, None] * matrix * columns))
     inverse, sizes = jnp.zeros_like(inverse).at[:, order].set(inverse), jnp.abs(pivots)
     singular = jnp.min(sizes) <= singular_threshold(len(matrix), matrix.dtype) * jnp.max(sizes)
@@ -60,7 +60,7 @@ def newton(f: Callable[[Vector], Vector], start: Vector, unit: Vector | float = 
         value, jacobian = f(x), jax.jacfwd(f)(x)
         new = x - _shorten_step(f, x, value, shortest_solution(jacobian, value, unit))
         # Each number of x by what it makes of f.
-        weight = 1 / _scales(jacobian)[1]
+        weight = 1 / _equilibration_factors(jacobian)[1]
         size = jnp.max(weight * jnp.maximum(jnp.abs(new), jnp.abs(x)), initial=jnp.finfo(x.dtype).tiny)
         return new, jnp.max(weight * jnp.abs(new - x), initial=0.0) / size, count + 1
 
@@ -144,7 +144,7 @@ _AT_REST = 1e-14  # of the size of x: some tens of roundings, the square of whic
 STEPS, HALVINGS = 50, 30
 
 
-def _scales(matrix: Matrix) -> tuple[Vector, Vector]:
+def _equilibration_factors(matrix: Matrix) -> tuple[Vector, Vector]:
     """Factors of the rows and of the columns that give each a largest entry of 1; 1 for those of zeros."""
     rows = _reciprocal(jnp.max(jnp.abs(matrix), axis=1))
     return rows, _reciprocal(jnp.max(jnp.abs(rows[:, None] * matrix), axis=0))

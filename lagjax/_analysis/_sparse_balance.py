@@ -81,13 +81,13 @@ def constraints_nearby(scene: SceneState, place: np.ndarray, unit: np.ndarray) -
 def descend(residual: Callable, jacobian_at: Callable, start: Unknowns, least: Unknowns, unit: Unknowns) -> Unknowns:
     """z (n,) after damped steps from `start` for the least |f(z)|², f (m,), as in `_solve`."""
     z, value, jacobian = start, np.asarray(residual(start)), jacobian_at(start)
-    weights = _reciprocal(_lengths(jacobian @ diags_array(unit), 1))
+    weights = _reciprocal(_column_lengths(jacobian @ diags_array(unit), 1))
     damping, scale = 0.1, np.zeros(len(z))
     for _ in range(DAMPED_STEPS):
         weighted, error = diags_array(weights) @ jacobian, weights * value
         if not error.any():
             break
-        scale = np.maximum(scale, _lengths(weighted, 0))
+        scale = np.maximum(scale, _column_lengths(weighted, 0))
         d = np.where(scale > 0, scale, unit)
         scaled, size = weighted @ diags_array(1 / d), np.linalg.norm(error)
         part = size / (size + (abs(weighted) @ np.maximum(least, np.abs(z))).max())
@@ -132,7 +132,7 @@ def _damped_solution(matrix: Sparse, b: np.ndarray, damping: float) -> np.ndarra
     return splu(bordered).solve(np.concatenate([b, np.zeros(n)]))[m:]
 
 
-def _lengths(matrix: Sparse, axis: int) -> np.ndarray:
+def _column_lengths(matrix: Sparse, axis: int) -> np.ndarray:
     return np.sqrt((matrix**2).sum(axis=axis))
 
 

@@ -103,9 +103,9 @@ def steady_motion(
     require_matrices(n, "A steady motion", "Follow the motion by simulate until it is steady.")
     scene = SceneState.from_state(system, q, qdot, params)
     scene.require_autonomous("A steady motion")
-    chosen = _chosen(scene, hold)
+    chosen = _held_coordinates(scene, hold)
     cyclic, moves, turns = find_symmetries(scene, chosen[1])
-    held = _held(scene, chosen, cyclic, moves)
+    held = _held_unknowns(scene, chosen, cyclic, moves)
     steady = Steady(jnp.asarray(cyclic), jnp.asarray(held), *(jnp.asarray(x, scene.q.dtype) for x in (moves, turns)))
     place, rate, multipliers, ok = find_balance(scene, steady)
     if throw and scene.concrete and not ok:
@@ -115,7 +115,7 @@ def steady_motion(
     return SteadyMotion(restore(place), restore(rate), of_user, ok, restore(cyclic), moves, turns)
 
 
-def _chosen(scene: SceneState, hold: Any) -> np.ndarray:
+def _held_coordinates(scene: SceneState, hold: Any) -> np.ndarray:
     """The coordinates and the velocities (2, n) that `hold` names. Raises an error for what names none."""
     names = scene.layout.names
     both = names, tuple(f"qdot{name.removeprefix('q')}" for name in names)
@@ -123,14 +123,14 @@ def _chosen(scene: SceneState, hold: Any) -> np.ndarray:
     if not (hold is None or np.iterable(hold)):
         raise TypeError(f"hold is a name, such as 'qdot[0]', or a tuple of names; got {hold!r}.")
     for wanted in (hold,) if isinstance(hold, str) else hold or ():
-        named = np.array([[_names(name, wanted) for name in of] for of in both])
+        named = np.array([[_contains_number(name, wanted) for name in of] for of in both])
         if not named.any():
             raise ValueError(f"hold names {wanted!r}, and the numbers are {', '.join(sum(both, ())[:24])}.")
         chosen |= named
     return chosen
 
 
-def _held(scene: SceneState, chosen: np.ndarray, cyclic: np.ndarray, moves: np.ndarray) -> np.ndarray:
+def _held_unknowns(scene: SceneState, chosen: np.ndarray, cyclic: np.ndarray, moves: np.ndarray) -> np.ndarray:
     """The unknowns (n,) that are held: velocities of `cyclic` coordinates, places of the others."""
     for k in np.flatnonzero(chosen[1] & ~moves.any(axis=1)):
         if scene.concrete and scene.qdot[k] != 0:
@@ -142,7 +142,7 @@ def _held(scene: SceneState, chosen: np.ndarray, cyclic: np.ndarray, moves: np.n
     return np.where(cyclic, chosen[1], chosen[0])
 
 
-def _names(name: str, wanted: Any) -> bool:
+def _contains_number(name: str, wanted: Any) -> bool:
     """True if a number is the one that is wanted, or one of an array or a pytree that is."""
     return name == wanted or (isinstance(wanted, str) and name.startswith((f"{wanted}[", f"{wanted}.")))
 

@@ -162,7 +162,7 @@ def conserved_quantities(
     rows, left = np.concatenate([verified.of_lagrangian, verified.of_others]), _SLACK * verified.threshold
     basis = _choose_basis(space, known, fields, names)
     chosen = [(name, w) for name, w in basis if np.abs(rows @ w).max() <= left * np.abs(w).max()]
-    quantities, notes = _quantities(scene, fields, chosen, fresh)
+    quantities, notes = _conserved_quantities(scene, fields, chosen, fresh)
     found = {name for name, _ in chosen}
     if measured.of_others.size:
         of_lagrangian = _choose_basis(measured.symmetries(measured.of_lagrangian), known, fields, names)
@@ -210,7 +210,9 @@ class _SymmetryColumns(NamedTuple):
 def _measure_columns(scene: SceneState, fields: Fields, states: FlatState) -> _SymmetryColumns:
     """The columns where they are finite, and their noise: how much they differ between states that hardly do."""
     both = states, perturb_last_digits(states)
-    here, beside = (_finite(*map(np.asarray, _columns(fields, at, *scene.arguments))) for at in both)
+    here, beside = (
+        _select_finite_rows(*map(np.asarray, _symmetry_columns(fields, at, *scene.arguments))) for at in both
+    )
     pairs = [(a, b) for a, b in zip(here, beside, strict=True) if a.size and a.shape == b.shape]
     noise = max((float(np.sqrt(np.mean((a - b) ** 2))) for a, b in pairs), default=0.0)
     return _SymmetryColumns(*here, min(max(_NULL, _CHANCE * noise), _LARGEST_REST))
@@ -228,7 +230,7 @@ def _flatten_generators(generators, layout: Layout) -> dict[str, Callable]:
 
 
 @compile_for_one_call
-def _columns(fields: Fields, states: FlatState, *arguments) -> tuple[Array, Array]:
+def _symmetry_columns(fields: Fields, states: FlatState, *arguments) -> tuple[Array, Array]:
     """The change under each of K transformations at S states: of L (S, n, K), of forces and constraints (S, r, K). Both
     in units of the terms that would have to cancel, so that entries are of order one unless there is a symmetry."""
     scene = SceneState.from_arguments(*arguments)
@@ -240,7 +242,7 @@ def _columns(fields: Fields, states: FlatState, *arguments) -> tuple[Array, Arra
         def expression(weights):
             transform = fields.transform(weights, scene.params)
             rate, by_q = euler_lagrange(lambda *y: variation(scene, transform, *y), state)
-            return rate - by_q, _work(scene, transform, state)
+            return rate - by_q, _work_and_drift(scene, transform, state)
 
         none, each = jnp.zeros(fields.count, state.q.dtype), jnp.eye(fields.count, dtype=state.q.dtype)
         of_l, of_others = jax.vmap(jax.linearize(expression, none)[1], out_axes=-1)(each)
@@ -252,7 +254,7 @@ def _columns(fields: Fields, states: FlatState, *arguments) -> tuple[Array, Arra
     return of_l / jnp.where(size > 0, size, 1), of_others / jnp.where(others > 0, others, 1)
 
 
-def _work(scene: SceneState, transform: Callable, state: FlatState) -> Array:
+def _work_and_drift(scene: SceneState, transform: Callable, state: FlatState) -> Array:
     """The work of forces on ξ − q̇ τ (1,) or (0,), and the rates (m,) at which it leaves constraints."""
     (change, of_time), place = transform(state.q, state.t), (state.q, state.qdot, state.t, scene.numbers)
     moved = change - state.qdot * of_time
@@ -264,7 +266,7 @@ def _work(scene: SceneState, transform: Callable, state: FlatState) -> Array:
     return jnp.concatenate(rows)
 
 
-def _finite(of_lagrangian: np.ndarray, of_others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _select_finite_rows(of_lagrangian: np.ndarray, of_others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The rows (rows, K) of states where all is finite. Raises `ValueError` where there are too few of them."""
     well = np.asarray(np.isfinite(of_lagrangian).all(axis=(1, 2)) & np.isfinite(of_others).all(axis=(1, 2)))
     if well.sum() < max(4, len(well) // 4):
@@ -296,7 +298,7 @@ def _choose_basis(
     return chosen + [(_describe_combination(row, fields, names), row) for row in echelon_form(rest.T)]
 
 
-def _readable(weights: np.ndarray, fields: Fields) -> np.ndarray:
+def _normalise_weights(weights: np.ndarray, fields: Fields) -> np.ndarray:
     """The weights in the units of q and t: the largest entry of α, b, c, A, β is 1."""
     return weights / max(np.abs(x).max(initial=0) for x in _restore_units(weights, fields))
 
@@ -310,7 +312,7 @@ def _restore_units(weights: np.ndarray, fields: Fields) -> tuple:
 
 def _describe_combination(weights: np.ndarray, fields: Fields, names: tuple[str, ...]) -> str:
     """A combination in words: its six largest parts, in units of the coordinates, in an order that has no units."""
-    alpha, b, c, a, beta, own = _restore_units(_readable(weights, fields), fields)
+    alpha, b, c, a, beta, own = _restore_units(_normalise_weights(weights, fields), fields)
     scale, time = fields.scale, fields.time
     parts = [(alpha, 1 / time, "time translation"), (beta, 1.0, "scaling of the time")]
     parts += [(x, 1 / one, f"translation of {name}") for x, one, name in zip(b, scale, names, strict=True)]
@@ -333,25 +335,25 @@ def _describe_combination(weights: np.ndarray, fields: Fields, names: tuple[str,
 # ---- the charge ------------------------------------------------------------------------------------------------------
 
 
-def _quantities(
+def _conserved_quantities(
     scene: SceneState, fields: Fields, chosen: list, states: FlatState
 ) -> tuple[list[Conserved], list[str]]:
     """The conserved quantities of the chosen symmetries, and what is to be said about others."""
     quantities, notes = [], []
     if not chosen:
         return quantities, notes
-    names, weights = [name for name, _ in chosen], np.array([_readable(w, fields) for _, w in chosen])
+    names, weights = [name for name, _ in chosen], np.array([_normalise_weights(w, fields) for _, w in chosen])
     changes, states = changes_of(scene, fields, weights, states)
-    for k in _independent(names, changes.gradients):
+    for k in _select_independent_charges(names, changes.gradients):
         gauge = gauge_of(scene, fields, weights[k], k, changes)
         if gauge is None or is_right(gauge, scene, fields, k, changes, states):
-            quantities.append(Conserved(names[k], _charge(scene, fields, weights[k], gauge), gauge))
+            quantities.append(Conserved(names[k], _noether_charge(scene, fields, weights[k], gauge), gauge))
         else:
             notes.append(f"not given: {names[k]}, by a symmetry whose gauge term could not be integrated")
     return quantities, notes
 
 
-def _independent(names: list[str], gradients: np.ndarray) -> list[int]:
+def _select_independent_charges(names: list[str], gradients: np.ndarray) -> list[int]:
     """The charges to keep of D with these gradients (S, D, 2n): combinations and dilations are dropped whose gradients
     lie in the span of the others at every state, as the angular momentum of the centre of mass."""
     kept = [k for k, name in enumerate(names) if not name.startswith(_DEPENDENT)]
@@ -372,7 +374,7 @@ def _independent_part(rows: np.ndarray, row: np.ndarray) -> float:
     return float(np.linalg.norm(row - basis @ (basis.T @ row)) / size)
 
 
-def _charge(scene: SceneState, fields: Fields, weights: np.ndarray, gauge: Callable | None) -> Callable:
+def _noether_charge(scene: SceneState, fields: Fields, weights: np.ndarray, gauge: Callable | None) -> Callable:
     """p·ξ − h τ − G of the symmetry with these weights (K,)."""
     system, layout = scene.system, scene.layout
 

@@ -75,13 +75,13 @@ class Fields(NamedTuple):
 
 def fields_of(layout: Layout, scale: np.ndarray, time: float, own: dict[str, Callable]) -> Fields:
     """The basis for coordinates of this layout, of these sizes (n,) and of this one of the time."""
-    named, maps = zip(*_maps(layout, scale), strict=True)
+    named, maps = zip(*_transformation_maps(layout, scale), strict=True)
     moved = [f"{how} of {name}" for how in ("translation", "boost") for name in layout.names]
     names = "time translation", *moved, *named, "scaling of the time", *own
     return Fields(scale, time, np.array(maps, float), names, tuple(own.values()))
 
 
-def _maps(layout: Layout, scale: np.ndarray) -> list[tuple[str, np.ndarray]]:
+def _transformation_maps(layout: Layout, scale: np.ndarray) -> list[tuple[str, np.ndarray]]:
     n, one, names = layout.size, np.eye(layout.size), layout.names
     if n <= _ALL_MAPS:
         pairs = np.ndindex(n, n)
@@ -106,7 +106,7 @@ def _leaf_places(layout: Layout) -> list[np.ndarray]:
 
 def textbook_symmetries(layout: Layout, fields: Fields) -> list[tuple[str, np.ndarray]]:
     """Combinations that textbooks name: the name of what they conserve, and their weights (K,)."""
-    n, axes, first_own = layout.size, _axes(layout), fields.count - len(fields.own)
+    n, axes, first_own = layout.size, _vector_axes(layout), fields.count - len(fields.own)
     one, each = np.eye(n), [(i, d, vectors[:, i]) for d, vectors in axes.items() for i in range(d)]
     along = [(i, d, np.isin(np.arange(n), places).astype(float)) for i, d, places in each]
     space = {d: "" if len(axes) == 1 else f" of {d}" for d in axes}
@@ -124,7 +124,7 @@ def textbook_symmetries(layout: Layout, fields: Fields) -> list[tuple[str, np.nd
     return [(name, weights) for name, weights in known if weights is not None]
 
 
-def _axes(layout: Layout) -> dict[int, np.ndarray]:
+def _vector_axes(layout: Layout) -> dict[int, np.ndarray]:
     """The vectors of all leaves whose last axis is 2 or 3 long, places (vectors, d), by d."""
     vectors = {}
     for place in _leaf_places(layout):

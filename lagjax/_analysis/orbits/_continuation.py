@@ -235,7 +235,7 @@ def step_along(follower: Follower, last: FamilyPoint, tangent: FamilyTangent, st
     sizes = np.append(sizes, [0.0, 0.0])
     contraction = sizes[1] / sizes[0] if sizes[1] > 1e-8 * step else 0.0
     cosine = np.clip(tangent.vector @ following.vector, -1.0, 1.0)
-    askew = _chord(follower, last, point, step) - (tangent.vector + following.vector) / 2
+    askew = _scaled_chord(follower, last, point, step) - (tangent.vector + following.vector) / 2
     for one in (tangent, following):
         askew -= one.symmetries @ (one.symmetries.T @ askew)
     share = max(
@@ -247,7 +247,7 @@ def step_along(follower: Follower, last: FamilyPoint, tangent: FamilyTangent, st
     return FamilyStep(point, following, float(share)) if share <= 1 else None
 
 
-def _chord(follower: Follower, last: FamilyPoint, point: FamilyPoint, step: float) -> np.ndarray:
+def _scaled_chord(follower: Follower, last: FamilyPoint, point: FamilyPoint, step: float) -> np.ndarray:
     """The change of what is free, (2n + F,), in units of the step."""
     change = jax.tree.map(np.subtract, point.unknowns, last.unknowns)
     period = change.period if follower.period_is_free else []

@@ -152,7 +152,7 @@ class _Member(NamedTuple):
     events: tuple[bool, bool, bool] = (False, False, False)
 
 
-def _member(follower: Follower, point: FamilyPoint, tangent: FamilyTangent, most: int | None) -> _Member:
+def _build_member(follower: Follower, point: FamilyPoint, tangent: FamilyTangent, most: int | None) -> _Member:
     """An orbit with its multipliers; at most `most` directions count as symmetries."""
     (symmetries,) = _shooting.symmetries(point.chain, most)
     count = symmetries.null.shape[2]
@@ -171,19 +171,19 @@ def _follow_family(follower: Follower, y0, period, step: float, count: int) -> t
     if tangent is None:
         alone = FamilyTangent(np.zeros(point.matrix.shape[1]), 0, np.zeros((point.matrix.shape[1], 0)))
         message = "The orbit is alone: it closes at no other energy, or parameter, near its own."
-        return [_member(follower, point, alone, None)], message
+        return [_build_member(follower, point, alone, None)], message
     wanted = until is None or until > follower.value(point)
     tangent = tangent if wanted else tangent._replace(vector=-tangent.vector)
-    members = [_member(follower, point, tangent, None)]
+    members = [_build_member(follower, point, tangent, None)]
     while len(members) < count:
         last = members[-1]
         there = step_along(follower, last.point, last.tangent, step)
         if there is None or _shooting.is_equilibrium(there.point.chain)[0]:
             step /= 2
             if step < shortest:
-                return members, _end(follower, last.point, there is not None)
+                return members, _end_of_family(follower, last.point, there is not None)
             continue
-        following = _member(follower, there.point, there.tangent, last.symmetries)
+        following = _build_member(follower, there.point, there.tangent, last.symmetries)
         members += _locate_events(follower, last, following, step)
         if until is not None and (follower.value(there.point) > until) == wanted:
             return members[:count], f"The family was followed until {until:.6g}."
@@ -206,7 +206,7 @@ def _refine_member(follower: Follower, member: _Member) -> _Member:
     return member if there is None else member._replace(point=there[0])
 
 
-def _end(follower: Follower, last: FamilyPoint, stopped: bool) -> str:
+def _end_of_family(follower: Follower, last: FamilyPoint, stopped: bool) -> str:
     where = f"{follower.value(last):.9g}, with a period of {last.chain.periods()[0]:.6g}"
     if stopped:
         return f"The family ends at an equilibrium, near {where}."
@@ -242,7 +242,7 @@ def _locate_event(follower: Follower, last: _Member, following: _Member, step: f
     across, found = last.tangent, {0.0: last, step: following}
     a, b = 0.0, step
     while b - a > _BRACKET * step:
-        zero, width = _zero(found, a, b, k), b - a
+        zero, width = _interpolate_zero(found, a, b, k), b - a
         for s in (max(zero, a + 2 * _BESIDE * width) - _BESIDE * width, zero + _BESIDE * width):
             if not a < s < b:
                 continue
@@ -253,12 +253,12 @@ def _locate_event(follower: Follower, last: _Member, following: _Member, step: f
             a, b = (s, b) if member.tests[k] * found[a].tests[k] > 0 else (a, s)
         if b - a > 0.9 * width:
             break
-    zero = _zero(found, a, b, k)
+    zero = _interpolate_zero(found, a, b, k)
     member = _orbit_between(follower, found, a, b, zero, across, int(k == 1), last.symmetries)
     return zero, found[a] if member is None else member
 
 
-def _zero(found: dict[float, _Member], a: float, b: float, k: int) -> float:
+def _interpolate_zero(found: dict[float, _Member], a: float, b: float, k: int) -> float:
     """The zero of the inverse polynomial through the four orbits nearest to a bracket; within it in any case."""
     near = sorted(found, key=lambda s: abs(s - (a + b) / 2))[:4]
     values = [found[s].tests[k] for s in near]
@@ -277,19 +277,19 @@ def _orbit_between(
     u, width = (s - a) / (b - a), b - a
     shares = (1 + 2 * u) * (1 - u) ** 2, u**2 * (3 - 2 * u), width * u * (1 - u) ** 2, width * u**2 * (u - 1)
     ends = (found[x].point.unknowns for x in (a, b))
-    slopes = (_rate(follower, found[x], across) for x in (a, b))
+    slopes = (_family_tangent(follower, found[x], across) for x in (a, b))
     guess = jax.tree.map(lambda *parts: sum(map(operator.mul, shares, parts)), *ends, *slopes)
     there = correct(follower, follower.rebuild(found[a].point, guess), across, left_out)
     tangent = None if there is None else tangent_at(follower, there[0], found[a].tangent, left_out)
     if there is None or tangent is None or tangent.vector @ across.vector < _ALONG:
         return None
-    return _member(follower, there[0], tangent, most)
+    return _build_member(follower, there[0], tangent, most)
 
 
 _ALONG = 0.7  # the cosine of the turn of a tangent between two neighbours, more than which they have by `step_along`
 
 
-def _rate(follower: Follower, member: _Member, across: FamilyTangent) -> FamilyUnknowns:
+def _family_tangent(follower: Follower, member: _Member, across: FamilyTangent) -> FamilyUnknowns:
     """The change of all numbers along the family by the arc across a tangent."""
     vector = member.tangent.vector / (member.tangent.vector @ across.vector)
     return follower.complete_change(member.point, vector, 0.0)
@@ -345,10 +345,10 @@ def branch_off(
         )
     turns = 2 if bool(family.doubling[index]) else 1
     beside = next(k for k in (index - 1, index + 1, index) if 0 <= k < len(family.value))
-    (y0, period, layout), (y0_beside, period_beside, _) = (_start(family, k, turns) for k in (index, beside))
+    (y0, period, layout), (y0_beside, period_beside, _) = (_orbit_start(family, k, turns) for k in (index, beside))
     place = None if by == "energy" else _parameter_index(params, by)
     arcs = Arcs.from_system(system, layout, params, RTOL, "Families")
-    numbers, numbers_beside = (_numbers(arcs, place, family, k) for k in (index, beside))
+    numbers, numbers_beside = (_orbit_numbers(arcs, place, family, k) for k in (index, beside))
     follower = Follower(arcs.with_numbers(numbers), place, y0, period)
     here = _first_point(follower, y0, period, numbers)
     before = tangent_at(follower, _first_point(follower, y0_beside, period_beside, numbers_beside), None)
@@ -362,14 +362,14 @@ def branch_off(
     return restore_orbits(follower.arcs.layout, FlatOrbits(*(x[0] for x in found)), found.message[0])
 
 
-def _start(family: Family, k: int, turns: int) -> tuple[np.ndarray, np.ndarray, Layout]:
+def _orbit_start(family: Family, k: int, turns: int) -> tuple[np.ndarray, np.ndarray, Layout]:
     """The first state (1, 2n) of orbit k and its period (1,), traversed `turns` times, and the layout of the state."""
     q0, qdot0 = jax.tree.map(lambda x: x[k], (family.q0, family.qdot0))
     period, layout, y0 = starts(q0, qdot0, turns * family.period[k], "period")
     return y0, period.ravel(), layout
 
 
-def _numbers(arcs: Arcs, place: int | None, family: Family, k: int) -> np.ndarray:
+def _orbit_numbers(arcs: Arcs, place: int | None, family: Family, k: int) -> np.ndarray:
     numbers = np.array(arcs.numbers)
     if place is not None:
         numbers[place] = float(family.value[k])

@@ -36,7 +36,7 @@ def reduce(growth: np.ndarray, null: np.ndarray, of_transpose: np.ndarray) -> Re
     count, states, _ = growth.shape
     if not null.shape[2]:
         return Reduced(growth, 0)
-    bases = [_quotient(w, ell) for w, ell in zip(null, of_transpose, strict=True)]
+    bases = [_quotient_basis(w, ell) for w, ell in zip(null, of_transpose, strict=True)]
     width, *others = {basis.shape[1] for basis in bases}
     if others:
         return Reduced(growth, 0)
@@ -44,7 +44,7 @@ def reduce(growth: np.ndarray, null: np.ndarray, of_transpose: np.ndarray) -> Re
     return Reduced(np.stack(moved), states - width)
 
 
-def _quotient(null: np.ndarray, of_transpose: np.ndarray) -> np.ndarray:
+def _quotient_basis(null: np.ndarray, of_transpose: np.ndarray) -> np.ndarray:
     """An orthonormal basis (2n, m) of the part of ker ℓ that is orthogonal to W ∩ ker ℓ."""
     w, ell = np.linalg.qr(null)[0], np.linalg.qr(of_transpose)[0]
     # Directions of W that ℓ does not see; those it sees are simple multipliers, outside of ker ℓ.

@@ -59,11 +59,11 @@ class JumpingMotions(NamedTuple):
         given = np.broadcast_to(times, (rows, times.shape[-1])), y0, modes
         more = 2 ** int(np.ceil(np.log2(rows))) - rows  # another number of rows compiles anew
         times, y0, modes = (np.concatenate([x, np.repeat(x[-1:], more, axis=0)]) for x in given)
-        return jax.tree.map(lambda x: np.array(x)[:rows], _follow(self, times, y0, modes, varies))
+        return jax.tree.map(lambda x: np.array(x)[:rows], _simulate_arcs(self, times, y0, modes, varies))
 
 
 @eqx.filter_jit
-def _follow(motions: JumpingMotions, times, y0, modes, varies: bool) -> JumpRun:
+def _simulate_arcs(motions: JumpingMotions, times, y0, modes, varies: bool) -> JumpRun:
     scene, layout, params, rtol = motions
     options = {"rtol": rtol, "throw": False, "max_transitions": _CHANGES_OF_ARC if varies else _CHANGES}
 

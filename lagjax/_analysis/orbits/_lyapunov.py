@@ -96,12 +96,12 @@ def lyapunov_spectrum(
         raise SimulationError(reason or "", None)
     pieces = max(1, -(-int(run.accepted.max()) // _STEPS_OF_ARC))
     size = max(1, _PORTION // pieces)
-    parts = [_spectra(arcs, y0[k : k + size], spans[k : k + size], pieces) for k in range(0, len(y0), size)]
+    parts = [_lyapunov_spectra(arcs, y0[k : k + size], spans[k : k + size], pieces) for k in range(0, len(y0), size)]
     exponents = np.concatenate(parts)
     return jnp.asarray(exponents if durations.ndim else exponents[0])
 
 
-def _spectra(arcs: Arcs, y0: np.ndarray, duration: np.ndarray, pieces: int) -> np.ndarray:
+def _lyapunov_spectra(arcs: Arcs, y0: np.ndarray, duration: np.ndarray, pieces: int) -> np.ndarray:
     """The exponents (N, 2n) of some motions, each from this many arcs."""
     members, states = y0.shape
     times = duration[:, None] * np.arange(pieces + 1) / pieces
@@ -164,13 +164,13 @@ def lyapunov_exponent(
     durations, layout, y0 = starts(q0, qdot0, duration, "duration")
     arcs = Arcs.from_system(system, layout, params, rtol, "Lyapunov exponents")
     some = [slice(k, k + _MEMBERS) for k in range(0, len(y0), _MEMBERS)]
-    value, error = np.concatenate([_largest(arcs, y0[x], durations.ravel()[x]) for x in some], axis=1)
+    value, error = np.concatenate([_largest_exponent(arcs, y0[x], durations.ravel()[x]) for x in some], axis=1)
     if not durations.ndim:
         value, error = value[0], error[0]
     return LyapunovExponent(*map(jnp.asarray, (value, error, np.isfinite(value))))
 
 
-def _largest(arcs: Arcs, y0: np.ndarray, duration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _largest_exponent(arcs: Arcs, y0: np.ndarray, duration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     (members, states), n = y0.shape, arcs.size
     flow = arcs.flow.tangent(1)
     numbers = np.concatenate([arcs.numbers, np.zeros_like(arcs.numbers)])[None]

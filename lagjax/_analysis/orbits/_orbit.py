@@ -53,10 +53,10 @@ class Orbit(NamedTuple):
     message: str | tuple[str, ...]
 
     def __repr__(self) -> str:
-        return "\n".join(_lines(self))
+        return "\n".join(_orbit_summary(self))
 
 
-def _lines(orbit: Orbit) -> list[str]:
+def _orbit_summary(orbit: Orbit) -> list[str]:
     named = jax.tree_util.tree_leaves_with_path(orbit.q0)
     batch = np.shape(orbit.period)
     contents = ", ".join(f"q0{jax.tree_util.keystr(path)} {np.shape(leaf)}" for path, leaf in named[:_SHOWN])
@@ -137,7 +137,7 @@ def periodic_orbit(
     require_flag(throw, "throw")
     periods, layout, y0 = starts(q0, qdot0, period, "period")
     arcs = Arcs.from_system(system, layout, params, RTOL, "Periodic orbits", may_jump=True)
-    found = find(_closing(arcs, energy, image), y0, periods.ravel())
+    found = find(_closing_conditions(arcs, energy, image), y0, periods.ravel())
     if periods.ndim == 0:
         if throw and not found.ok[0]:
             raise SimulationError(found.message[0], None)
@@ -150,7 +150,7 @@ def restore_orbits(layout: Layout, found: "FlatOrbits", message: str | tuple[str
     return Orbit._make([*jax.tree.map(jnp.asarray, (q, qdot, *found[1:6])), message])
 
 
-def _closing(arcs: Arcs, energy, image) -> Closing:
+def _closing_conditions(arcs: Arcs, energy, image) -> Closing:
     """The conditions on an orbit. Raises for an energy that is no number, and an image that is not affine."""
     if energy is not None:
         require_number(energy, "energy")
@@ -227,7 +227,7 @@ def arc_counts(arcs: Arcs, y0, period) -> np.ndarray:
 def assess_orbits(closing: Closing, chain: Chain, most: int | None = None) -> FlatOrbits:
     """The orbits that the chains of a search are, with multipliers and a sentence where one is none; at most `most`
     directions count as symmetries, None for all that monodromy − 1 sends to zero."""
-    message = np.array([_sentence(chain, k) for k in range(len(chain.period))], object)
+    message = np.array([_explain_no_orbit(chain, k) for k in range(len(chain.period))], object)
     ok = np.array([not text for text in message])
     multipliers = np.full((len(ok), chain.y.shape[2]), np.nan, complex)
     if ok.any():
@@ -246,7 +246,7 @@ def assess_orbits(closing: Closing, chain: Chain, most: int | None = None) -> Fl
     return FlatOrbits(chain.states(), chain.periods(), multipliers, chain.closure(), stable & ok, ok, message)
 
 
-def _sentence(chain: Chain, k: int) -> str:
+def _explain_no_orbit(chain: Chain, k: int) -> str:
     if not chain.ok[k]:
         return f"The motion from the guess cannot be followed for a period of {chain.periods()[k]:.6g}. {chain.why[k]}"
     if _shooting.is_equilibrium(chain.select(np.array([k])))[0]:

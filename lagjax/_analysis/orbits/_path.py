@@ -96,16 +96,16 @@ def action(system: System, path: Trajectory | Callable, t_start=None, t_end=None
     system = require_system(system)
     if isinstance(path, Trajectory):
         params = path.params if params is None else params
-        ts, states = _motion_states(system, path, params)
+        ts, states = _states_of_motion(system, path, params)
     else:
-        ts, states = _function_states(path, t_start, t_end)
+        ts, states = _states_of_function(path, t_start, t_end)
     halved = np.sort(np.concatenate([ts, (ts[1:] + ts[:-1]) / 2]))[:: 1 if ts[-1] > ts[0] else -1]
 
     def lagrangians(times):
         q, qdot = states(times := jnp.asarray(times))
         return jax.vmap(lambda q, qdot, t: system.lagrangian(q, qdot, t=t, params=params))(q, qdot, times)
 
-    coarse, fine = (_integral(lagrangians, edges) for edges in (ts, halved))
+    coarse, fine = (_action_integral(lagrangians, edges) for edges in (ts, halved))
     if not abs(float(coarse[0] - fine[0])) <= _RESOLVED * abs(float(fine[1])):
         raise ValueError(
             f"The action is not resolved: {float(coarse[0]):.9g} and, on parts half as long, {float(fine[0]):.9g}. The "
@@ -115,7 +115,7 @@ def action(system: System, path: Trajectory | Callable, t_start=None, t_end=None
     return fine[0]
 
 
-def _motion_states(system: System, path: Trajectory, params) -> tuple[np.ndarray, Callable]:
+def _states_of_motion(system: System, path: Trajectory, params) -> tuple[np.ndarray, Callable]:
     """The times of outputs, and what gives (q, q̇) of a motion at times between."""
     q, qdot = jax.tree.map(lambda x: x[0], (path.q, path.qdot))
 
@@ -126,7 +126,7 @@ def _motion_states(system: System, path: Trajectory, params) -> tuple[np.ndarray
     return np.asarray(path.ts), states
 
 
-def _function_states(path, t_start, t_end) -> tuple[np.ndarray, Callable]:
+def _states_of_function(path, t_start, t_end) -> tuple[np.ndarray, Callable]:
     """The edges of equal parts of the time, and what gives (q, q̇) of a function of the time."""
     if not callable(path):
         raise TypeError(f"path must be a Trajectory, or a function of the time; got {type(path).__name__}.")
@@ -139,7 +139,7 @@ def _function_states(path, t_start, t_end) -> tuple[np.ndarray, Callable]:
     return np.linspace(float(t_start), float(t_end), _PANELS + 1), states
 
 
-def _integral(lagrangians: Callable, edges: np.ndarray) -> tuple[Any, Any]:
+def _action_integral(lagrangians: Callable, edges: np.ndarray) -> tuple[Any, Any]:
     """∫ L dt and ∫ |L| dt over panels between these edges; `lagrangians` are L at times (T,)."""
     half = np.diff(edges)[:, None] / 2
     times = edges[:-1, None] + half * (1 + _NODES)
@@ -191,8 +191,8 @@ def find_path(
     first = _guess_states(layout, guess, ends, times)
     closing = Closing.plain(arcs)._replace(t_first=times[0], q_end=ends[1])
     parts = np.linspace(0.0, 1.0, _ARCS + 1)[None]
-    chain = close(closing, first[None], times[-1:] - times[:1], parts, _units(arcs, first, ends, times))
-    message = _why_not(closing, chain, times)
+    chain = close(closing, first[None], times[-1:] - times[:1], parts, _path_units(arcs, first, ends, times))
+    message = _explain_no_path(closing, chain, times)
     if message:
         if throw:
             raise SimulationError(message, None)
@@ -201,7 +201,7 @@ def find_path(
     return _build_path(system, arcs, chain, ends[0], times, params)
 
 
-def _units(arcs: Arcs, y, ends, times) -> Units:
+def _path_units(arcs: Arcs, y, ends, times) -> Units:
     """The units of the first state, (1, 2n), with the farther one of both ends as the size of q."""
     n, duration, farther = arcs.size, times[-1:] - times[:1], np.abs(ends).max(axis=0)
     velocity = np.maximum(np.abs(y[0, n:]), np.abs(ends[1] - ends[0]) / duration)
@@ -227,7 +227,7 @@ def _guess_states(layout: Layout, guess, ends, times) -> np.ndarray:
     return y
 
 
-def _why_not(closing: Closing, chain: Chain, times) -> str:
+def _explain_no_path(closing: Closing, chain: Chain, times) -> str:
     between = f"between t = {times[0]:.6g} and {times[-1]:.6g}"
     if not chain.ok[0]:
         return (
@@ -266,7 +266,7 @@ def _arc_action(arcs: Arcs, y, t_first, t_last) -> float:
         path = arcs.ends(np.append(t_first, times)[None], y[None]).path[0, 1:]
         return arcs.sample(times, path).quantities("lagrangian")["lagrangian"]
 
-    return float(_integral(lagrangians, np.linspace(t_first, t_last, 9))[0])
+    return float(_action_integral(lagrangians, np.linspace(t_first, t_last, 9))[0])
 
 
 # ---- conjugate times -------------------------------------------------------------------------------------------------
@@ -283,8 +283,8 @@ def _conjugate_times(arcs: Arcs, y: np.ndarray, times: np.ndarray, units: Units)
     frame = np.concatenate([np.zeros((n, n)), np.eye(n)])  # (δq, δq̇) of all velocities
     for k, start in enumerate(y):
         ts = np.linspace(times[k], times[k + 1], _GLANCES + 1)
-        frames = _frames(arcs, start, ts, frame, units)
-        phases = _phases(arcs, _states(arcs, start, ts), ts, frames, units)
+        frames = _tangent_frames(arcs, start, ts, frame, units)
+        phases = _plane_phases(arcs, _states_on_arcs(arcs, start, ts), ts, frames, units)
         for j in range(k == 0, _GLANCES):  # without the start itself, where all paths meet
             for nth in range(_count_turns(phases[j], phases[j + 1])):
                 found.append(_locate_conjugate_time(arcs, start, ts[0], ts[j], ts[j + 1], frame, frames[j], nth, units))
@@ -295,7 +295,7 @@ def _conjugate_times(arcs: Arcs, y: np.ndarray, times: np.ndarray, units: Units)
     return found[found <= times[-1] - _AT_END * duration], at_end
 
 
-def _frames(arcs: Arcs, start, ts, frame, units: Units) -> np.ndarray:
+def _tangent_frames(arcs: Arcs, start, ts, frame, units: Units) -> np.ndarray:
     """The tangents (T, 2n, n) at times (T,) that begin as `frame` at the first one."""
     times = np.stack([np.full(len(ts) - 1, ts[0]), ts[1:]], axis=1)
     arc = arcs.follow(times, np.repeat(start[None], len(times), axis=0))
@@ -303,7 +303,7 @@ def _frames(arcs: Arcs, start, ts, frame, units: Units) -> np.ndarray:
     return np.linalg.qr(np.concatenate([frame[None], units.growth(arc.by_start) @ frame]))[0]
 
 
-def _phases(arcs: Arcs, y, t, frames, units: Units) -> np.ndarray:
+def _plane_phases(arcs: Arcs, y, t, frames, units: Units) -> np.ndarray:
     """The phases (T, n), ascending in [0, 2π), of the unitary matrices of planes (T, 2n, n) at states y (T, 2n)."""
     n = arcs.size
     canonical = np.linalg.qr(arcs.canonical(t, y, units) @ frames)[0]
@@ -312,7 +312,7 @@ def _phases(arcs: Arcs, y, t, frames, units: Units) -> np.ndarray:
     return np.sort(np.mod(np.angle(np.linalg.eigvals(unitary)), 2 * np.pi), axis=1)
 
 
-def _states(arcs: Arcs, start, ts) -> np.ndarray:
+def _states_on_arcs(arcs: Arcs, start, ts) -> np.ndarray:
     return arcs.ends(ts[None], start[None]).path[0]
 
 
@@ -324,14 +324,14 @@ def _count_turns(before: np.ndarray, after: np.ndarray) -> int:
 
 def _locate_conjugate_time(arcs: Arcs, start, t_first, low, high, frame, frame_low, nth: int, units: Units) -> float:
     """The time of the nth conjugate time between `low` and `high`, counted from 0, by bisection."""
-    state = _states(arcs, start, np.array([t_first, low]))[-1:] if low > t_first else start[None]
-    before = _phases(arcs, state, np.array([low]), frame_low[None], units)[0]
+    state = _states_on_arcs(arcs, start, np.array([t_first, low]))[-1:] if low > t_first else start[None]
+    before = _plane_phases(arcs, state, np.array([low]), frame_low[None], units)[0]
     for _ in range(_TRIALS):
         middle = (low + high) / 2
         if not low < middle < high:
             break
         ts = np.array([t_first, middle])
-        frames = _frames(arcs, start, ts, frame, units)[1:]
-        after = _phases(arcs, _states(arcs, start, ts)[1:], ts[1:], frames, units)[0]
+        frames = _tangent_frames(arcs, start, ts, frame, units)[1:]
+        after = _plane_phases(arcs, _states_on_arcs(arcs, start, ts)[1:], ts[1:], frames, units)[0]
         low, high = (low, middle) if _count_turns(before, after) > nth else (middle, high)
     return float((low + high) / 2)

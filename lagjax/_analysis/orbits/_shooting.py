@@ -232,14 +232,14 @@ def close(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray
         if not active.any():
             break
         places = np.flatnonzero(active)
-        better = _improve(closing, chain.select(places))
+        better = _damped_newton_step(closing, chain.select(places))
         after, before = better.merit(), chain.merit()[places]
         chain = replace_members(chain, places[after < before], better.select(after < before))
         active[places[~(after < 0.9 * before)]] = False
     return chain
 
 
-def _improve(closing: Closing, chain: Chain) -> Chain:
+def _damped_newton_step(closing: Closing, chain: Chain) -> Chain:
     """Each chain after the largest share of one step by which its defect falls."""
     dy, dperiod = correction(closing, chain)
     longest = np.minimum(1.0, 0.25 * chain.period / np.maximum(np.abs(dperiod), 1e-300))
@@ -267,9 +267,9 @@ class Symmetries(NamedTuple):
 def symmetries(chain: Chain, most: int | None = None) -> list[Symmetries]:
     """The null spaces of closed chains, at most `most` directions: those of the smallest singular values, as a branch
     point has more by chance."""
-    forward, null = _null(chain.growth)
+    forward, null = _closure_null_vectors(chain.growth)
     # ℓ_k = G_kᵀ ℓ_(k+1): the same chain, walked back from the end.
-    back, of_transpose = _null(np.swapaxes(chain.growth[:, ::-1], 2, 3))
+    back, of_transpose = _closure_null_vectors(np.swapaxes(chain.growth[:, ::-1], 2, 3))
     found, states = [], chain.y.shape[2]
     for k in range(len(chain.period)):
         first = max(forward.rank[k], back.rank[k], 0 if most is None else states - most)
@@ -278,7 +278,7 @@ def symmetries(chain: Chain, most: int | None = None) -> list[Symmetries]:
     return found
 
 
-def _null(growth: np.ndarray) -> tuple[Decided, np.ndarray]:
+def _closure_null_vectors(growth: np.ndarray) -> tuple[Decided, np.ndarray]:
     """The decision about A + B of chains that are closed, and the right vectors at all states, (B, K, 2n, 2n)."""
     chains, count, states, _ = growth.shape
     condensed = condense(growth, np.zeros((chains, count, states, 0)))
