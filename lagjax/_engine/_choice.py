@@ -30,7 +30,7 @@ def requested_engine(
     asked["a progress meter was"] = progress is not False
     if isinstance(solver, MachineCode):
         if what := next((what for what, given in asked.items() if given), None):
-            raise ValueError(_refusal(f"{what} asked for"))
+            raise ValueError(_explain_refusal(f"{what} asked for"))
         return solver
     if solver is None and not any(asked.values()):
         return None
@@ -47,7 +47,7 @@ def choose(problem: Problem, requested: AbstractEngine | None = None, members: i
         if refusal is None:
             return Choice(_MACHINE_CODE, None)
         if requested is not None:
-            raise ValueError(_refusal(refusal))
+            raise ValueError(_explain_refusal(refusal))
         requested = _import_diffrax()()
     else:
         refusal = "diffrax was asked for"
@@ -64,7 +64,7 @@ def _import_diffrax() -> Any:
     return Diffrax
 
 
-def _refusal(reason: str) -> str:
+def _explain_refusal(reason: str) -> str:
     return (
         f"solver=lagjax.MachineCode() cannot integrate this: {reason}. Leave solver at None, and diffrax integrates "
         "what machine code cannot."

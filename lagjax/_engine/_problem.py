@@ -215,7 +215,7 @@ class Batch(eqx.Module):
 
         Raises `TypeError` or `ValueError` as `Problem.from_arguments`; a number of one member alone may be NaN.
         """
-        member = {name: jax.tree.map(_shape_of_one, value, axes[name]) for name, value in values.items()}
+        member = {name: jax.tree.map(_member_shape, value, axes[name]) for name, value in values.items()}
         layout = Layout.from_state(member["q0"], member["qdot0"])
         times = output_times(ts, layout.dtype, rows=True)
         each = times if times.ndim == 2 else times[None]
@@ -228,7 +228,7 @@ class Batch(eqx.Module):
         params, structure = jax.tree.flatten(arrays["params"])
         of_params = structure.flatten_up_to(axes["params"])
         pairs = zip(params, of_params, strict=True)
-        in_front = [x if k is None else (xp := _library_of(x)).moveaxis(xp.asarray(x), k, 0) for x, k in pairs]
+        in_front = [x if k is None else (xp := _array_library(x)).moveaxis(xp.asarray(x), k, 0) for x, k in pairs]
         of_state = (jax.tree.structure(values[name]).flatten_up_to(axes[name]) for name in ("q0", "qdot0"))
         y0 = rows(state, itertools.chain(*of_state), size, layout.dtype)
         spread = tuple(None if axis is None else 0 for axis in of_params)
@@ -322,7 +322,7 @@ class AbstractEngine(abc.ABC):
         rtol, atol, ts = self.rtol(problem), problem.tolerances[1], problem.ts
         if atol is not None:
             return rtol, as_arrays(atol, problem.layout.dtype, "atol")
-        library = _library_of(y0, ts, rtol)
+        library = _array_library(y0, ts, rtol)
         # Within `jit` an operation on an array of JAX is traced, even where its numbers are known.
         ts, relative = library.asarray(ts), library.asarray(rtol)
         far, fast = (library.abs(half).max(axis=-1) for half in halves(library.asarray(y0)))
@@ -353,7 +353,7 @@ def _is_on_host(leaf) -> bool:
     return is_concrete(leaf) and [device.platform for device in leaf.devices()] == ["cpu"]
 
 
-def _library_of(*leaves) -> Any:
+def _array_library(*leaves) -> Any:
     """NumPy where it can read all of them, else JAX's."""
     return np if all(map(_is_on_host, leaves)) else jnp
 
@@ -371,7 +371,7 @@ def concatenate_leaves(leaves: list, dtype) -> Float[Numbers, " count"]:
 
 def rows(leaves, axes, size: int, dtype) -> Float[Numbers, "size numbers"]:
     """The numbers of every member end to end, shape (size, numbers); `axes` are those of the members, leaf by leaf."""
-    library = _library_of(*leaves)
+    library = _array_library(*leaves)
     columns = [library.zeros((size, 0), dtype)]
     for leaf, axis in zip(leaves, axes, strict=True):
         array = library.asarray(leaf, dtype)
@@ -382,7 +382,7 @@ def rows(leaves, axes, size: int, dtype) -> Float[Numbers, "size numbers"]:
     return library.concatenate(columns, axis=1)
 
 
-def _shape_of_one(leaf, axis):
+def _member_shape(leaf, axis):
     """A leaf of one member: zeros of its shape, which cost nothing, or what all members share."""
     if axis is None:
         return leaf
@@ -450,7 +450,7 @@ def _check_fields(dtype, params, ts, rtol, atol, max_steps, event) -> dict[str, 
     def array(x):
         return np.asarray(x, DOUBLE) if x is not None and is_concrete(x) else as_arrays(x, dtype)
 
-    tolerances, event = (array(rtol), array(atol)), _event(event)
+    tolerances, event = (array(rtol), array(atol)), _checked_event(event)
     return dict(params=as_arrays(params, dtype), ts=ts, tolerances=tolerances, max_steps=max_steps, event=event)
 
 
@@ -466,15 +466,15 @@ def too_tight(rtol, dtype, least: float) -> str | None:
     )
 
 
-def _event(event) -> Event | None:
+def _checked_event(event) -> Event | None:
     """The event with its functions' signatures checked."""
     if isinstance(event, types.FunctionType):
-        return _known_event(Edition.from_function(event))
+        return _reuse_event(Edition.from_function(event))
     return None if event is None else _make_event(event)
 
 
 @functools.lru_cache(maxsize=64)  # a signature takes as long to read as a short motion
-def _known_event(event: Edition) -> Event:
+def _reuse_event(event: Edition) -> Event:
     return _make_event(event.function)
 
 
@@ -505,11 +505,11 @@ def evaluate_condition(function: Callable, *arguments) -> tuple[Any, int]:
     given = [leaves[i] for i in numbers]
     closed, shape = jax.make_jaxpr(call, return_shape=True)(*given)
     is_bool = getattr(shape, "dtype", None) == np.dtype(bool) and shape.shape == ()
-    found = _difference(closed.jaxpr, closed.consts, given) if is_bool else None
+    found = _traced_difference(closed.jaxpr, closed.consts, given) if is_bool else None
     return (function(*arguments), 0) if found is None else found
 
 
-def _difference(jaxpr, constants, arguments) -> tuple[Any, int] | None:
+def _traced_difference(jaxpr, constants, arguments) -> tuple[Any, int] | None:
     """The difference of two numbers and its sign, where a jaxpr compares them; None where it does something else."""
     (out,) = jaxpr.outvars
     equation = next((e for e in jaxpr.eqns if out in e.outvars), None)
@@ -522,9 +522,9 @@ def _difference(jaxpr, constants, arguments) -> tuple[Any, int] | None:
     name = equation.primitive.name
     if name in ("jit", "pjit", "closed_call"):
         inner, run = equation.params["jaxpr"], core.ClosedJaxpr(with_outputs(equation.invars), constants)
-        return _difference(inner.jaxpr, inner.consts, core.jaxpr_as_fun(run)(*arguments))
+        return _traced_difference(inner.jaxpr, inner.consts, core.jaxpr_as_fun(run)(*arguments))
     if name in (*_PASSING_ON, "not"):
-        found = _difference(with_outputs(equation.invars[:1]), constants, arguments)
+        found = _traced_difference(with_outputs(equation.invars[:1]), constants, arguments)
         return found and (found[0], -found[1] if name == "not" else found[1])
     if name not in _SIGNS or not jnp.issubdtype(equation.invars[0].aval.dtype, jnp.floating):
         return None

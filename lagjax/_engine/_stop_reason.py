@@ -50,7 +50,7 @@ def what_stopped(acceleration: Callable, at: End, shrank, spent) -> tuple[jax.Ar
     those whose budget of steps is spent; others are not looked at.
     """
     on_host = isinstance(at.y, np.ndarray)
-    library, loop, evaluate_each = (np, _loop, map) if on_host else (jnp, jax.lax.while_loop, _map_compiled)
+    library, loop, evaluate_each = (np, _loop_in_python, map) if on_host else (jnp, jax.lax.while_loop, _map_compiled)
     n = at.y.shape[-1] // 2
     smallest = 4 * np.finfo(at.y.dtype).eps * library.maximum(abs(at.begin), abs(at.end))
     forward = library.where(at.end > at.begin, 1.0, -1.0) * smallest
@@ -59,7 +59,7 @@ def what_stopped(acceleration: Callable, at: End, shrank, spent) -> tuple[jax.Ar
     def acceleration_after(s):
         return acceleration(at.t + s, at.y + s[..., None] * rate)
 
-    half = _half_width(library, at, smallest, shrank)
+    half = _jump_window(library, at, smallest, shrank)
     *ahead, low, high = evaluate_each(acceleration_after, [*(steps * forward for steps in AHEAD), -half, half])
     defined = shrank
     for value in ahead:
@@ -90,7 +90,7 @@ def what_stopped(acceleration: Callable, at: End, shrank, spent) -> tuple[jax.Ar
     return shrank & ~defined, looked_at & (left > JUMP) & (left < POLE)
 
 
-def _half_width(library, at: End, smallest, shrank):
+def _jump_window(library, at: End, smallest, shrank):
     """The time before the end in which a jump is looked for."""
     mean = abs(at.t - at.begin) / library.maximum(at.accepted, 1)
     fighting = at.rejected > FIGHTING * (at.accepted + at.rejected)
@@ -102,7 +102,7 @@ def _map_compiled(function: Callable, arguments: list) -> jax.Array:
     return jax.lax.map(function, jnp.stack(arguments))
 
 
-def _loop(goes_on: Callable, body: Callable, carry):
+def _loop_in_python(goes_on: Callable, body: Callable, carry):
     while goes_on(carry):
         carry = body(carry)
     return carry

@@ -45,7 +45,7 @@ _MOST_CLIMBED = 60
 _INDEFINITE = "its mass matrix is not positive definite and needs pivoting"
 
 
-class _Saddle(NamedTuple):
+class _SaddleSystem(NamedTuple):
     """M x − Gᵀλ = b, G x = c by the names of b (None: zero) and c, the `sign` of c, whether `velocities` are in G."""
 
     b: str | None
@@ -55,9 +55,9 @@ class _Saddle(NamedTuple):
 
 
 _MATRICES = "mass_matrix", "jacobian"
-_ACCELERATION = _Saddle("force", "gamma", 1)
-_VELOCITY_STEP = _Saddle(None, "rates", -1)
-_POSITION_STEP = _Saddle(None, "residual", -1, velocities=False)
+_ACCELERATION = _SaddleSystem("force", "gamma", 1)
+_VELOCITY_STEP = _SaddleSystem(None, "rates", -1)
+_POSITION_STEP = _SaddleSystem(None, "residual", -1, velocities=False)
 
 
 def lowered_once(make: Callable) -> property:
@@ -81,7 +81,7 @@ def lowered_once(make: Callable) -> property:
     return property(get)
 
 
-class _Entries(NamedTuple):
+class _MatrixEntries(NamedTuple):
     """The numbers of a matrix that are not zero as it is derived, and their rows and columns."""
 
     # An array of scipy.sparse, whose import takes a tenth of the first motion of a small scene, would be no shorter.
@@ -114,7 +114,7 @@ class Accelerations:
         self._made: dict[str, Any] = {}
         self._lock = threading.RLock()
         self._responses: dict[tuple[int, ...], Program] = {}
-        self._sampled: dict[float, list[tuple[_Entries, _Entries]]] = {}
+        self._sampled: dict[float, list[tuple[_MatrixEntries, _MatrixEntries]]] = {}
 
     @lowered_once
     def program(self) -> Program:
@@ -129,23 +129,23 @@ class Accelerations:
         Machine code changes over where that comes about, with the numbers of the run at hand; XLA, which has to write
         the program down before it knows them, takes the one that always holds (`Program.complete`).
         """
-        mechanics = self._mechanics
+        mechanics = self._kick_mechanics
         if (variant := self._recursive_acceleration()) is not None:
             return replace(variant, otherwise=lambda: self.general, mechanics=mechanics)
         usual = self.motion.constrained and not self.motion.constraints.held
-        if not usual or self._constant_mass or not self._regular(_ACCELERATION):
+        if not usual or self._constant_mass or not self._is_mass_regular(_ACCELERATION):
             return self.general
-        variant = self._solution(_ACCELERATION, regular_only=True)
+        variant = self._saddle_solution(_ACCELERATION, regular_only=True)
         return replace(variant, otherwise=lambda: self.general, mechanics=mechanics)
 
     @lowered_once
     def general(self) -> Program:
-        program, mechanics = self._solution(_ACCELERATION), self._mechanics
+        program, mechanics = self._saddle_solution(_ACCELERATION), self._kick_mechanics
         residual = None if self.motion.constrained or self.of.has_rules else lambda: self.of.unbalanced_force
         return replace(program, mechanics=mechanics, residual=residual)
 
     @lowered_once
-    def _mechanics(self) -> StraightLine | None:
+    def _kick_mechanics(self) -> StraightLine | None:
         """The quantities that decide where L jumps (`_kick.Mechanics`), as one line; None if nothing is piecewise.
 
         Constraints that numbers release, those of contacts, are left out: they push, and do not pull.
@@ -165,7 +165,7 @@ class Accelerations:
         """λ, those of `constraints` first; redundant ones are zero. None without constraints."""
         if not self.motion.constrained:
             return None
-        system, solve = self._system(_ACCELERATION)
+        system, solve = self._scalar_system(_ACCELERATION)
 
         def multipliers(*scalars):
             _, _, right, factors, _ = system(*scalars)
@@ -181,7 +181,7 @@ class Accelerations:
         """
         if rows in self._responses:
             return self._responses[rows]
-        system, solve = free.accelerations._system(_VELOCITY_STEP)
+        system, solve = free.accelerations._scalar_system(_VELOCITY_STEP)
         n, (m, _), (others, _) = self.layout.size, self.of.shape("jacobian"), free.shape("jacobian")
         parts, acceleration = self.of.program("jacobian", "residual", "rates", "gamma"), free.accelerations.program
 
@@ -203,8 +203,8 @@ class Accelerations:
         if not self.motion.constrained:
             return None
         n = self.layout.size
-        velocity = self._solution(_VELOCITY_STEP)
-        position = None if self.motion.constraints.on_positions is None else self._solution(_POSITION_STEP)
+        velocity = self._saddle_solution(_VELOCITY_STEP)
+        position = None if self.motion.constraints.on_positions is None else self._saddle_solution(_POSITION_STEP)
 
         def projected(*scalars):
             q, v, rest = stack(scalars[:n]), stack(scalars[n : 2 * n]), scalars[n:]
@@ -237,26 +237,26 @@ class Accelerations:
         """The programs by which machine code keeps a motion on its constraints; None without any."""
         return None if self.projected is None else Projection(self.projected, self.velocity_scales)
 
-    def _solution(self, saddle: _Saddle, regular_only: bool = False) -> Program:
+    def _saddle_solution(self, saddle: _SaddleSystem, regular_only: bool = False) -> Program:
         """x of a linear system, and then whether it is singular."""
-        system, solve = self._system(saddle, regular_only)
+        system, solve = self._scalar_system(saddle, regular_only)
         return lower_solution(system, solve, self.layout.size, *self.of.scalar_shapes, budget=forms.OPERATION_BUDGET)
 
     @lowered_once
     def lacks(self) -> str | None:
         """Why its accelerations are not solved for on scalars, as the end of a sentence; None where they are."""
         try:
-            self._system(_ACCELERATION)
+            self._scalar_system(_ACCELERATION)
         except Unlowerable as why:
             return str(why)
 
-    def _system(self, saddle: _Saddle, regular_only: bool = False) -> tuple[Callable, Callable]:
+    def _scalar_system(self, saddle: _SaddleSystem, regular_only: bool = False) -> tuple[Callable, Callable]:
         """A z = r with z = (x, −λ), as two functions of scalars.
 
         The first gives the entries of A, r, factors of A and whether it is singular; the second z, of factors and r.
         """
-        n, m, regular = self.layout.size, self._row_count(saddle), self._regular(saddle)
-        if regular is None and not self._pivots:
+        n, m, regular = self.layout.size, self._row_count(saddle), self._is_mass_regular(saddle)
+        if regular is None and not self._mass_pivots:
             raise Unlowerable(_INDEFINITE)
         zeros = self.of.absent("mass_matrix"), self.of.absent("jacobian")[:m]
         released = self.motion.constraints.held is not None
@@ -274,7 +274,7 @@ class Accelerations:
                 f"to solve for the accelerations takes some {elimination.operations} operations, more than the "
                 f"{forms.OPERATION_BUDGET} that are expected to fit in memory"
             )
-        parts = self._parts(saddle, elimination, m)
+        parts = self._elimination_parts(saddle, elimination, m)
         count, places = len(elimination.entries), elimination.entries
 
         def system(*scalars):
@@ -289,7 +289,7 @@ class Accelerations:
 
     def _recursive_acceleration(self) -> Program | None:
         """q̈ by the recursion in L; None where there is none, or where it does not hold at a sampled state."""
-        if self.of.recursion is None or self._regular(_ACCELERATION) is None:
+        if self.of.recursion is None or self._is_mass_regular(_ACCELERATION) is None:
             return None
         elimination, n = RecursiveElimination(self.of.recursion, self.layout.dtype), self.layout.size
         places, count = elimination.entries, len(elimination.entries)
@@ -302,11 +302,11 @@ class Accelerations:
             return places, values[:count], right, *elimination.factors(values[:count])
 
         program = lower_solution(system, elimination.solve, n, *self.of.scalar_shapes, budget=forms.OPERATION_BUDGET)
-        return program if self._agrees(program) else None
+        return program if self._solves_equations(program) else None
 
-    def _agrees(self, program: Program) -> bool:
+    def _solves_equations(self, program: Program) -> bool:
         """True if a program for q̈ gives that of M q̈ = F at the sampled states."""
-        columns = self._columns()
+        columns = self._input_columns()
         of = self.of.evaluate(["mass_matrix", "force"], columns)
         exact = solve_many(of["mass_matrix"], of["force"][:, :, None])[:, :, 0]
         *found, singular = program.evaluate_many(columns)
@@ -314,7 +314,7 @@ class Accelerations:
         error = np.abs(np.array(found).T - exact)[usable]
         return not singular[usable].any() and bool((error <= 1e-6 * np.abs(exact[usable]).max(initial=0)).all())
 
-    def _parts(self, saddle: _Saddle, elimination, constraints: int) -> Callable:
+    def _elimination_parts(self, saddle: _SaddleSystem, elimination, constraints: int) -> Callable:
         """A formula for the entries of an elimination, the `constraints` numbers of c, and b, end to end."""
         n = self.layout.size
         row, column = elimination.entries.T
@@ -331,39 +331,39 @@ class Accelerations:
         cut = functools.cache(lambda: self.of.whole.select_outputs(positions))
         return lambda *scalars: cut().vector(*scalars)
 
-    def _row_count(self, saddle: _Saddle) -> int:
+    def _row_count(self, saddle: _SaddleSystem) -> int:
         return self.of.shape("jacobian")[0] if saddle.velocities else self.of.position_count
 
     @lowered_once
     def _constant_mass(self) -> bool:
         return not self.of.reads("mass_matrix")
 
-    def samples(self, reach: float = 1.0, numbers: Any = None) -> "list[tuple[_Entries, _Entries]]":
+    def samples(self, reach: float = 1.0, numbers: Any = None) -> "list[tuple[_MatrixEntries, _MatrixEntries]]":
         """M and G at a few states that nothing speaks for, where they are finite; `numbers` are those of params."""
         if numbers is not None:
-            return self._evaluate_matrices([*self._columns(reach)[: 2 * self.layout.size + 1], *numbers])
+            return self._evaluate_matrices([*self._input_columns(reach)[: 2 * self.layout.size + 1], *numbers])
         if reach not in self._sampled:
-            self._sampled[reach] = self._evaluate_matrices(self._columns(reach))
+            self._sampled[reach] = self._evaluate_matrices(self._input_columns(reach))
         return self._sampled[reach]
 
     @functools.cached_property
-    def _entries(self) -> Program:
+    def _matrix_entries(self) -> Program:
         """The numbers of M and G that are not zero as they are derived."""
         return self.of.whole.select_outputs([k for name in _MATRICES for k in self.of.filled_positions(name)])
 
-    def _evaluate_matrices(self, columns: list) -> "list[tuple[_Entries, _Entries]]":
+    def _evaluate_matrices(self, columns: list) -> "list[tuple[_MatrixEntries, _MatrixEntries]]":
         shapes, ends = [self.of.shape(name) for name in _MATRICES], [len(self.of.filled["mass_matrix"])]
         places = [np.divmod(self.of.filled[name], self.layout.size) for name in _MATRICES]
-        samples = [np.split(x, ends) for x in self._entries.evaluate_many(columns).T if np.isfinite(x).all()]
-        make: Any = _Entries
+        samples = [np.split(x, ends) for x in self._matrix_entries.evaluate_many(columns).T if np.isfinite(x).all()]
+        make: Any = _MatrixEntries
         return [tuple(map(make, of, places, shapes)) for of in samples]
 
-    def _columns(self, reach: float = 1.0) -> list[np.ndarray]:
+    def _input_columns(self, reach: float = 1.0) -> list[np.ndarray]:
         """The inputs at these states, one array (states,) for each: of order one, but q of this order."""
         n, columns = self.layout.size, np.random.default_rng(0).uniform(0.3, 1.2, (3, len(self.of.scalar_shapes))).T
         return [reach * x for x in columns[:n]] + list(columns[n:])
 
-    def _regular(self, saddle: _Saddle) -> bool | None:
+    def _is_mass_regular(self, saddle: _SaddleSystem) -> bool | None:
         """True if M is regular in general: at all of the sampled states; None where it need not be positive definite.
 
         Elimination without pivoting is for positive definite M. With constraints M may be singular, and is then
@@ -372,12 +372,12 @@ class Accelerations:
         a scene counts as positive definite that is so at all states near, or at all far away.
         """
         for reach in (1.0, _FAR):
-            if (regular := self._judge(self.samples(reach), self._row_count(saddle))) is not None:
+            if (regular := self._judge_regularity(self.samples(reach), self._row_count(saddle))) is not None:
                 return regular
-        samples = self.samples(1.0, self._favorable) if self.of.counts_on_params else None
-        return None if samples is None else self._judge(samples, self._row_count(saddle))
+        samples = self.samples(1.0, self._favorable_params) if self.of.counts_on_params else None
+        return None if samples is None else self._judge_regularity(samples, self._row_count(saddle))
 
-    def _judge(self, samples: "list[tuple[_Entries, _Entries]]", m: int) -> bool | None:
+    def _judge_regularity(self, samples: "list[tuple[_MatrixEntries, _MatrixEntries]]", m: int) -> bool | None:
         """True if M is regular at some states; None where it is not positive definite, on m rows of G at rest."""
         regular = True
         for matrix, jacobian in samples:
@@ -394,29 +394,29 @@ class Accelerations:
     def depend_on_params(self) -> bool:
         """True if nothing pivots, and parameters decide whether M is positive definite."""
         try:
-            settled = self._pivots or self._regular(_ACCELERATION) is not None
-            return not settled and self._favorable is not None
+            settled = self._mass_pivots or self._is_mass_regular(_ACCELERATION) is not None
+            return not settled and self._favorable_params is not None
         except Unlowerable:
             return False
 
     def suit(self, numbers: np.ndarray) -> bool:
         """True if M is positive definite with these parameters, at all sampled states near or at all far away."""
         rows = self._row_count(_ACCELERATION)
-        return any(self._judge(self.samples(reach, numbers), rows) is not None for reach in (1.0, _FAR))
+        return any(self._judge_regularity(self.samples(reach, numbers), rows) is not None for reach in (1.0, _FAR))
 
     @property
-    def _pivots(self) -> bool:
+    def _mass_pivots(self) -> bool:
         return not self.motion.constrained and self.layout.size <= _saddle.LARGEST_INDEFINITE
 
     @functools.cached_property
-    def _favorable(self) -> np.ndarray | None:
+    def _favorable_params(self) -> np.ndarray | None:
         """Numbers of params, none negative, that make M, with GᵀG, positive definite; None where none are found.
 
         From those of the samples it is climbed along the slopes of what is negative in M: couplings, which are numbers
         of their own, fall to zero.
         """
         first = 2 * self.layout.size + 1
-        program, columns = self.of.program("mass_matrix", "jacobian"), [x[:1] for x in self._columns()]
+        program, columns = self.of.program("mass_matrix", "jacobian"), [x[:1] for x in self._input_columns()]
         for _ in range(_MOST_CLIMBED):
             samples = self._evaluate_matrices(columns)
             if not samples:

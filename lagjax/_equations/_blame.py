@@ -43,25 +43,25 @@ def offenders(function: Callable, *arguments, derivatives: bool = True) -> list[
 
     def visit(equation, operands, moves, results, place):
         chosen = [i for i, x in enumerate(operands) if moves[i] and _floating(x)]
-        if not all(_finite(x) for x, moved in zip(operands, moves, strict=True) if moved):
+        if not all(_are_finite(x) for x, moved in zip(operands, moves, strict=True) if moved):
             return
         # A NaN that is written into the function counts where it is taken, as in where(t > 1, nan, force). An infinity
         # does not: where(mask, q, -inf) is meant.
-        if not all(map(_finite, operands)) and not any(_floating(x) and np.isnan(x).any() for x in results):
+        if not all(map(_are_finite, operands)) and not any(_floating(x) and np.isnan(x).any() for x in results):
             return
         name = _name(equation)
-        if not all(_finite(x) for x in results):
+        if not all(_are_finite(x) for x in results):
             if equation.primitive.name == "select_n" and len(operands) == 3:
                 operands = [operands[0], operands[2], operands[1]]  # as users write it: condition, if true, if not
-            collected.append(Offender(name, _operands(operands, results), place, "value"))
-        elif derivatives and chosen and all(map(_finite, operands)) and any(_floating(x) for x in results):
-            first, second = _derivatives(equation, operands, chosen)
+            collected.append(Offender(name, _failing_operands(operands, results), place, "value"))
+        elif derivatives and chosen and all(map(_are_finite, operands)) and any(_floating(x) for x in results):
+            first, second = _operation_derivatives(equation, operands, chosen)
             for fault, values in (("first derivative", first), ("second derivative", second)):
-                if not all(_finite(x) for x in values):
-                    collected.append(Offender(name, _operands(operands, values), place, fault))
+                if not all(_are_finite(x) for x in values):
+                    collected.append(Offender(name, _failing_operands(operands, values), place, fault))
                     break
 
-    _follow(function, arguments, visit, into_rules=False)
+    _visit_equations(function, arguments, visit, into_rules=False)
     return collected
 
 
@@ -72,16 +72,16 @@ def poles(function: Callable, *arguments) -> list[Offender]:
     def visit(equation, operands, moves, results, place):
         chosen = [i for i, x in enumerate(operands) if moves[i] and _floating(x)]
         # The result may be NaN, as that of log(x) for x < 0, whose derivatives are those of log(-x).
-        if equation.primitive.name not in _WITH_POLES or not chosen or not all(map(_finite, operands)):
+        if equation.primitive.name not in _WITH_POLES or not chosen or not all(map(_are_finite, operands)):
             return
-        _, second = _derivatives(equation, operands, chosen)
+        _, second = _operation_derivatives(equation, operands, chosen)
         large = [np.where(np.abs(x) > _AT_A_POLE, np.inf, 0.0) for x in map(np.asarray, second)]
         if equation.primitive.name in _POWERS:  # x⁴ is as curved at 1e13, where there is no pole
             large = [np.where(np.abs(operands[i]) < 1, x, 0.0) for i, x in zip(chosen, large, strict=True)]
-        if not all(map(_finite, large)):
-            collected.append(Offender(_name(equation), _operands(operands, large), place, "second derivative"))
+        if not all(map(_are_finite, large)):
+            collected.append(Offender(_name(equation), _failing_operands(operands, large), place, "second derivative"))
 
-    _follow(function, arguments, visit, into_rules=False)
+    _visit_equations(function, arguments, visit, into_rules=False)
     return collected
 
 
@@ -107,7 +107,7 @@ def borders(function: Callable, *arguments) -> list[tuple[str, str, Any]]:
             whole = [jnp.ravel(jnp.asarray(x, float)) for x in results if not _floating(x)]
             collected.extend([(name, place, jnp.concatenate(whole))] if whole else [])
 
-    _follow(function, arguments, visit, into_rules=True)
+    _visit_equations(function, arguments, visit, into_rules=True)
     return collected
 
 
@@ -157,7 +157,7 @@ _CALLS = ("jit", "pjit", "closed_call", "core_call", "checkpoint", "remat", "rem
 _RULES = ("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
 
 
-def _follow(function: Callable, arguments: tuple, visit: Callable, into_rules: bool) -> None:
+def _visit_equations(function: Callable, arguments: tuple, visit: Callable, into_rules: bool) -> None:
     """Evaluate `function(q, qdot, t, params)`, and show every equation that q, q̇ or t moves to `visit`."""
     # A function with a custom rule for its derivative counts as one operation, unless `into_rules`.
     closed = jax.make_jaxpr(function)(*arguments)
@@ -182,12 +182,12 @@ def _run(jaxpr, constants, arguments, moves, outer: str, visit: Callable, inside
     for equation in jaxpr.eqns:
         operands, moved = [read(x) for x in equation.invars], [is_dependent(x) for x in equation.invars]
         # A jitted library function keeps the source line of its first caller: the line is that of the outermost call.
-        place = outer or _place(equation)
-        body = _body(equation) if equation.primitive.name in inside else None
+        place = outer or _line_phrase(equation)
+        body = _called_body(equation) if equation.primitive.name in inside else None
         if body is not None:
             results, out_moved = _run(body[0], body[1], operands, moved, place, visit, inside)
         else:
-            results = _bind(equation, operands)
+            results = _evaluate_equation(equation, operands)
             out_moved = [any(moved)] * len(results)
             if any(moved):
                 visit(equation, operands, moved, results, place)
@@ -196,7 +196,7 @@ def _run(jaxpr, constants, arguments, moves, outer: str, visit: Callable, inside
     return [read(x) for x in jaxpr.outvars], [is_dependent(x) for x in jaxpr.outvars]
 
 
-def _body(equation) -> tuple | None:
+def _called_body(equation) -> tuple | None:
     if equation.primitive.name == "call_hi_primitive":
         closed = expand_primitive(equation.params["_prim"])
         return closed.jaxpr, closed.consts
@@ -206,14 +206,14 @@ def _body(equation) -> tuple | None:
     return (body.jaxpr, body.consts) if hasattr(body, "consts") else (body, ())
 
 
-def _bind(equation, operands) -> list:
+def _evaluate_equation(equation, operands) -> list:
     bound = equation.primitive.get_bind_params(equation.params)
     functions, params = bound if isinstance(bound, tuple) else ((), bound)  # before and since jax 0.10
     results = equation.primitive.bind(*functions, *operands, **params)
     return list(results) if equation.primitive.multiple_results else [results]
 
 
-def _derivatives(equation, operands, chosen: list[int]) -> tuple[list, list]:
+def _operation_derivatives(equation, operands, chosen: list[int]) -> tuple[list, list]:
     """The first and second derivatives of one operation, summed over its results, by the `chosen` operands."""
     # Reverse mode, then forward over reverse, as the derivation of the equations takes them.
 
@@ -221,7 +221,7 @@ def _derivatives(equation, operands, chosen: list[int]) -> tuple[list, list]:
         filled = list(operands)
         for i, x in zip(chosen, xs, strict=True):
             filled[i] = x
-        return [x for x in _bind(equation, filled) if _floating(x)]
+        return [x for x in _evaluate_equation(equation, filled) if _floating(x)]
 
     def slopes(*xs):
         results, pull_back = jax.vjp(local, *xs)
@@ -233,12 +233,12 @@ def _derivatives(equation, operands, chosen: list[int]) -> tuple[list, list]:
 
 
 def _name(equation) -> str:
-    body = _body(equation) if equation.primitive.name in _RULES else None
+    body = _called_body(equation) if equation.primitive.name in _RULES else None
     own = getattr(getattr(body[0], "debug_info", None), "func_name", None) if body else None
     return own or {"select_n": "where"}.get(equation.primitive.name, equation.primitive.name)  # as users call it
 
 
-def _place(equation) -> str:
+def _line_phrase(equation) -> str:
     """The user's line, as the end of a sentence; empty where it is one of lagjax."""
     summary = source_info_util.summarize(equation.source_info)  # file:line (function)
     file = summary.partition(":")[0]
@@ -250,13 +250,13 @@ def _floating(x) -> bool:
     return jnp.issubdtype(jnp.result_type(x), jnp.floating)
 
 
-def _finite(x) -> bool:
+def _are_finite(x) -> bool:
     return not _floating(x) or bool(np.isfinite(np.asarray(x)).all())
 
 
-def _operands(operands, failing) -> str:
+def _failing_operands(operands, failing) -> str:
     """The operands where the first of `failing` is not finite, number by number if they have its shape."""
-    bad = next(np.asarray(x) for x in failing if not _finite(x))
+    bad = next(np.asarray(x) for x in failing if not _are_finite(x))
     index = tuple(np.argwhere(~np.isfinite(bad))[0])
 
     def show(x):

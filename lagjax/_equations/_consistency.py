@@ -36,19 +36,19 @@ def require_consistent(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, pa
     if not has_constraints(system) or not all(map(is_concrete, jax.tree.leaves((ts, q0, qdot0, params, system)))):
         return
     names = system.constraint_names(layout, params)
-    start = _start(system, layout, ts, q0, qdot0, params)
+    start = _measure_start(system, layout, ts, q0, qdot0, params)
     _require_gradients(names, start)
     dependent = {} if start.schur is None else dependent_rows(start.schur)
     functions = system.constraints, system.velocity_constraints  # one that asks for the time may prescribe a motion
     if not (start.driven or any("t" in function.extras for function in functions if function is not None)):
         _require_room(names, start, layout.size, len(names) - len(dependent))
     tolerance = TOLERANCE[layout.dtype]
-    if next(_faults(names, start, dependent, tolerance, np.zeros((3, len(names)))), None) is None:
+    if next(_start_faults(names, start, dependent, tolerance, np.zeros((3, len(names)))), None) is None:
         return  # as most starts, without a look at rounding
     derivation, q, qdot, t, numbers, _ = start.sample
     terms = derivation.term_sizes(q[0], qdot[0], t, numbers, ("residual", "rates", "gamma"))
     rounding = ROUNDINGS * np.finfo(layout.dtype).eps * rows_of_terms(terms, (3, len(names)))
-    for is_of_q, sentence in _faults(names, start, dependent, tolerance, rounding):
+    for is_of_q, sentence in _start_faults(names, start, dependent, tolerance, rounding):
         if is_of_q:  # constraints that ask for different steps may still meet somewhere
             nearest, _ = eqx.filter_jit(system.project)(q0, qdot0, ts[0], params)
             if all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(nearest)):
@@ -56,7 +56,7 @@ def require_consistent(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, pa
         raise ValueError(sentence)
 
 
-def _faults(names, start, dependent, tolerance, rounding) -> Iterator[tuple[bool, str]]:
+def _start_faults(names, start, dependent, tolerance, rounding) -> Iterator[tuple[bool, str]]:
     """Sentences for contradictions (True: of positions) and distances beyond `rounding` (3, m) of values, rates, γ."""
     of_rows = (
         (start.values, start.size_q, "q0", "it"),
@@ -166,7 +166,7 @@ def _inconsistent(has_terms: bool, system, dtype, t, span, q0: PyTree, qdot0: Py
     return is_inconsistent(motion, state, span, dtype, terms)
 
 
-def _start(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> _StartConditions:
+def _measure_start(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> _StartConditions:
     """The start of a motion, measured without compiling anything where the scene has programs."""
     layout = dataclasses.replace(layout, dtype=Layout.from_state(q0, qdot0).dtype)  # in float64 also for float32
     q, qdot = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(x)]) for x in (q0, qdot0))

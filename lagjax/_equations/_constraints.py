@@ -209,7 +209,7 @@ def nearest_consistent(motion, q: Vector, qdot: Vector, t: Time, params: PyTree,
     unit = motion.unit(q, qdot, t, params)
     qdot = qdot + motion.velocity_step(q, qdot, t, params)
     rates, lengths = constraints.rates(q, qdot, t, params), motion.row_lengths(unit, q, qdot, t, params)
-    reached = _holds(rates, lengths, of_rates, unit, qdot, given)
+    reached = _constraints_hold(rates, lengths, of_rates, unit, qdot, given)
     return q, qdot * jnp.where(reached, 1.0, jnp.nan)  # a product, so that derivatives are NaN as well
 
 
@@ -269,7 +269,7 @@ def _nearest_positions(motion: Any, q0, qdot, t, params, terms) -> Vector:
 
         # For a q0 that is consistent both distances are round-off.
         farther = distance(q) > 1.001 * distance(nearby[0]) + resolution(q) * q.size
-        holds = _holds(constraints.f(q, t, params), lengths(q), terms, unit, q, q0)
+        holds = _constraints_hold(constraints.f(q, t, params), lengths(q), terms, unit, q, q0)
         return jnp.where(holds & ~farther, q, jnp.nan), nu
 
     begin = q0, jnp.zeros_like(constraints.f(q0, t, params))
@@ -292,7 +292,7 @@ def _iterate_to_rest(step: Callable, start: tuple[Vector, Row], is_at_rest: Call
     return jnp.where(is_at_rest(q, moved), q, jnp.nan), nu
 
 
-def _holds(residual: Row, lengths: Row, terms: Row, unit: Vector, *states: Vector) -> Bool[Array, ""]:
+def _constraints_hold(residual: Row, lengths: Row, terms: Row, unit: Vector, *states: Vector) -> Bool[Array, ""]:
     """True if constraints hold, in which case the steps did not just become small between some that contradict.
 
     A distance of √eps of the state is allowed: the last step of Newton's method was at the level of rounding, so that

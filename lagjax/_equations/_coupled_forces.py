@@ -57,7 +57,7 @@ class CoupledForces(eqx.Module):
         schur = moved @ jacobian.T
         solved = eliminate(schur if released is None else schur + jnp.diag(released), right)
         zero = jnp.zeros_like(solved[:, 0])
-        places, at_zero = _multipliers_read(self.law, *state, zero)
+        places, at_zero = _find_multipliers_read(self.law, *state, zero)
         read = np.array(places, int)
         law = lambda some: self.law(*state, zero.at[read].set(some))  # noqa: E731
         return _solve_law(law, solved[read, 0], solved[read, 1:], at_zero) if read.size else self.law(*state, zero)
@@ -83,7 +83,7 @@ def couple_forces(motion, law: Callable, layout, params: PyTree):
     if constraints.held is None:
         return dataclasses.replace(motion, forces=CoupledForces(law, motion))
     own = constraints.drag
-    if any(_dependence(lambda some: law(*state, some), jnp.asarray(zero))):
+    if any(_slopes_depend_on_multipliers(lambda some: law(*state, some), jnp.asarray(zero))):
         free = dataclasses.replace(motion, constraints=dataclasses.replace(constraints, drag=None))
         rubbing = law if own is None else (lambda *given: law(*given) + own(*given[:-1]) @ given[-1])
         return dataclasses.replace(free, forces=CoupledForces(rubbing, free))
@@ -101,7 +101,7 @@ def _solve_law(of_read: Callable, alone, responses, at_zero: bool):
 
     `at_zero` says that it is one of which all pieces meet at zero.
     """
-    decisive, curved = _dependence(of_read, alone)
+    decisive, curved = _slopes_depend_on_multipliers(of_read, alone)
     zero, unit, count = jnp.zeros_like(alone), jnp.eye(len(alone), dtype=alone.dtype), len(alone)
     some = alone + responses @ of_read(zero) if decisive else zero
     before, single = some, count == 1 and at_zero and not curved
@@ -122,7 +122,7 @@ def _solve_law(of_read: Callable, alone, responses, at_zero: bool):
     return jnp.where(1.0 + off < 2.0, force, jnp.nan)
 
 
-def _multipliers_read(law: Callable, *arguments) -> tuple[list[int], bool]:
+def _find_multipliers_read(law: Callable, *arguments) -> tuple[list[int], bool]:
     """The places of the multipliers, the last argument of a law, that it reads; all where it has no program.
 
     And whether it is one of which all pieces meet where that is zero.
@@ -144,17 +144,17 @@ def _multipliers_read(law: Callable, *arguments) -> tuple[list[int], bool]:
     return places, bool((np.ptp(slopes, axis=2) <= 1e-6 * np.abs(slopes).max()).all())
 
 
-def _dependence(law: Callable, multipliers) -> tuple[bool, bool]:
+def _slopes_depend_on_multipliers(law: Callable, multipliers) -> tuple[bool, bool]:
     """True if the slopes of a law by its multipliers depend on these; and if they do so but for their pieces."""
 
     def slopes(some):
         return jax.jacfwd(law)(some)
 
-    curved = _inputs_read(lambda some, along: jax.jvp(slopes, (some,), (along,))[1], multipliers, multipliers)[1]
-    return any(_inputs_read(slopes, multipliers)), curved
+    curved = _find_inputs_read(lambda some, along: jax.jvp(slopes, (some,), (along,))[1], multipliers, multipliers)[1]
+    return any(_find_inputs_read(slopes, multipliers)), curved
 
 
-def _inputs_read(function: Callable, *arguments) -> list[bool]:
+def _find_inputs_read(function: Callable, *arguments) -> list[bool]:
     jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
     return dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))[1]
 

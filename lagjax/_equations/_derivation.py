@@ -110,12 +110,12 @@ class Derivation:
         If nothing pivots, and params decide whether M is positive definite, it is one that assumes so, unless known
         numbers contradict it.
         """
-        doubted = self._counting_on_params
+        doubted = self._assuming_definite_mass
         known = doubted is not None and numbers is not None and is_concrete(numbers)
         return self if doubted is None or (known and not self.accelerations.suit(np.asarray(numbers))) else doubted
 
     @functools.cached_property
-    def _counting_on_params(self) -> "Derivation | None":
+    def _assuming_definite_mass(self) -> "Derivation | None":
         """The derivation that counts on a positive definite M, where this one does not and needs to."""
         if self.path == "array" or not self.accelerations.depend_on_params:
             return None
@@ -205,7 +205,7 @@ class Derivation:
         return self._programs[names]
 
     @functools.cached_property
-    def _starts(self) -> dict[str, int]:
+    def _output_starts(self) -> dict[str, int]:
         ends = np.cumsum([1, *map(len, self.filled.values())]).tolist()
         return dict(zip(self._shapes, ends, strict=False))
 
@@ -288,7 +288,7 @@ class Derivation:
     def filled_positions(self, name: str) -> range:
         """The outputs that are numbers of this quantity which are not zero as they are derived."""
         self.whole  # noqa: B018  (its trace says where quantities start)
-        return range(self._starts[name], self._starts[name] + len(self.filled[name]))
+        return range(self._output_starts[name], self._output_starts[name] + len(self.filled[name]))
 
     @lowered_once
     def works(self) -> bool:
@@ -402,15 +402,15 @@ def numbers_of(params: PyTree) -> list:
 # ---- made once ---------------------------------------------------------------------------------------------------
 
 
-class _Number(NamedTuple):
+class _NumberKey(NamedTuple):
     """The key of a number, or of an array of them, among the parameters."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
 
 
-class _Structure(NamedTuple):
-    """All that decides how a scene is derived, structure alone; a leaf of params is a `_Number`, or program."""
+class _SceneStructure(NamedTuple):
+    """All that decides how a scene is derived, structure alone; a leaf of params is a `_NumberKey`, or program."""
 
     system: Any
     layout: Layout
@@ -420,7 +420,7 @@ class _Structure(NamedTuple):
     @property
     def restored(self) -> tuple[Any, Layout, PyTree]:
         """The scene, the layout, and the parameters with zeros for numbers."""
-        leaves = [np.zeros(*leaf) if isinstance(leaf, _Number) else leaf for leaf in self.leaves]
+        leaves = [np.zeros(*leaf) if isinstance(leaf, _NumberKey) else leaf for leaf in self.leaves]
         return jax.tree.unflatten(self.system, []), self.layout, jax.tree.unflatten(self.params, leaves)
 
 
@@ -438,7 +438,7 @@ def derivation_of(system: Any, layout: Layout, params: PyTree) -> Derivation:
     try:
         hash(key)
     except TypeError as reason:
-        return _derived(key, str(reason))
+        return _derive_structure(key, str(reason))
     return _derived_once(key)
 
 
@@ -458,21 +458,21 @@ def once_for_structure(make: Callable) -> Callable:
     return find
 
 
-def _structure_key(system: Any, layout: Layout, params: PyTree) -> _Structure | None:
+def _structure_key(system: Any, layout: Layout, params: PyTree) -> _SceneStructure | None:
     """All that decides how a scene is derived; None where its functions hold arrays."""
     arrays, scene = jax.tree.flatten(system)
     leaves, tree = jax.tree.flatten(params)
     kept = (
-        _Number(np.shape(x), np.dtype(dtype_of(x))) if type(x) is np.ndarray or eqx.is_array_like(x) else x
+        _NumberKey(np.shape(x), np.dtype(dtype_of(x))) if type(x) is np.ndarray or eqx.is_array_like(x) else x
         for x in leaves
     )
-    return None if arrays else _Structure(scene, layout, tree, tuple(kept))
+    return None if arrays else _SceneStructure(scene, layout, tree, tuple(kept))
 
 
-def _derived(key: _Structure, unhashable: str | None = None) -> Derivation:
+def _derive_structure(key: _SceneStructure, unhashable: str | None = None) -> Derivation:
     system, layout, params = key.restored
     numbers = eqx.filter(params, eqx.is_array_like)
     return Derivation(system._motion(layout, params), layout, numbers, unhashable=unhashable, path=system.path)
 
 
-_derived_once = functools.lru_cache(maxsize=64)(_derived)
+_derived_once = functools.lru_cache(maxsize=64)(_derive_structure)

@@ -139,7 +139,7 @@ def invert(matrix: Matrix) -> tuple[Matrix, Int[Array, " n"], Vector]:
     def one_panel(index, carry):
         a, free, order, pivots = carry
         columns = jax.lax.dynamic_slice_in_dim(a, index * width, width, 1)
-        panel, left, panel_order, panel_pivots = _eliminate(columns, free)
+        panel, left, panel_order, panel_pivots = _eliminate_panel(columns, free)
         if count > 1:
             a = jnp.where((free & ~left)[:, None], 0, a) + panel @ _permute_rows(a, panel_order)
             panel = jax.lax.dynamic_update_slice_in_dim(a, panel, index * width, 1)
@@ -151,7 +151,7 @@ def invert(matrix: Matrix) -> tuple[Matrix, Int[Array, " n"], Vector]:
     return _permute_rows(a, order[:n])[:, :n], order[:n], pivots[:n]
 
 
-def _eliminate(panel: Array, free: Array) -> tuple[Array, Array, Array, Array]:
+def _eliminate_panel(panel: Array, free: Array) -> tuple[Array, Array, Array, Array]:
     """A panel of columns (size, width) after elimination, which rows are still free, the pivots' rows, the pivots."""
 
     def one_column(k, carry):
@@ -160,7 +160,7 @@ def _eliminate(panel: Array, free: Array) -> tuple[Array, Array, Array, Array]:
         column = jnp.sum(jnp.where(this_column, panel, 0), axis=1)
         row = jnp.argmax(jnp.where(free, jnp.abs(column), -1)).astype(np.int32)  # the first NaN, if there is one
         this_row = np.arange(len(panel)) == row
-        panel, pivot = _exchange(panel, this_row, this_column)
+        panel, pivot = _pivot_step(panel, this_row, this_column)
         order, pivots = jnp.where(this_column, row, order), jnp.where(this_column, pivot, pivots)
         return panel, free & ~this_row, order, pivots
 
@@ -169,7 +169,7 @@ def _eliminate(panel: Array, free: Array) -> tuple[Array, Array, Array, Array]:
     return jax.lax.fori_loop(0, width, one_column, start)
 
 
-def _exchange(a: Array, this_row: Array, this_column: Array) -> tuple[Array, Array]:
+def _pivot_step(a: Array, this_row: Array, this_column: Array) -> tuple[Array, Array]:
     """The array A after one column was eliminated by one row, each given as a mask, and the pivot between them."""
     # Masks and not indices, which become gathers and scatters under `vmap`: masks are faster on the CPU, as measured.
     row = jnp.sum(jnp.where(this_row[:, None], a, 0), axis=0)
@@ -260,7 +260,7 @@ def _inverse_on_range(matrix: Matrix) -> Matrix:
     # consistent before a motion starts. So it chooses among multipliers that all give the same motion, and hides no
     # contradiction.
     scaled, scale = unit_diagonal(matrix)
-    inverse, basis, pairs = _independent(scaled, scale)
+    inverse, basis, pairs = _factor_independent(scaled, scale)
     some = scale[:, None] * inverse * scale  # solves S x = b, but its x need not be the shortest
     # The part of x in the range of S is the shortest one: P x with P = B (BᵀB)⁻¹ Bᵀ, where B is the basis of the range
     # scaled back. BᵀB is at least the unit matrix; where B has no column, that of the unit matrix takes its place.
@@ -283,10 +283,10 @@ def _inverse_on_range_jvp(primals, tangents):
 
 def rank(matrix: Matrix) -> Int[Array, ""]:
     """The number of independent rows of a symmetric matrix (m, m): `rank_tolerance` decides what counts as zero."""
-    return jnp.sum(_independent(matrix, jnp.ones(len(matrix), matrix.dtype))[2]).astype(int)
+    return jnp.sum(_factor_independent(matrix, jnp.ones(len(matrix), matrix.dtype))[2]).astype(int)
 
 
-def _independent(matrix: Matrix, scale: Vector) -> tuple[Matrix, Matrix, Matrix]:
+def _factor_independent(matrix: Matrix, scale: Vector) -> tuple[Matrix, Matrix, Matrix]:
     """X, B and Q of a symmetric A, (m, m) each, by elimination with complete pivoting.
 
     A X A = A; B is a basis of the range of A; Q is 1 where a row was the pivot of a column. The elimination ends where
@@ -306,7 +306,7 @@ def _independent(matrix: Matrix, scale: Vector) -> tuple[Matrix, Matrix, Matrix]
         index = jnp.argmax(jnp.where(good, size / (scale[:, None] * scale), -1))
         row, column = np.arange(m) == index // m, np.arange(m) == index % m
         counts = ~(largest <= rank_tolerance(a.dtype))
-        a = jnp.where(counts, _exchange(a, row, column)[0], a)
+        a = jnp.where(counts, _pivot_step(a, row, column)[0], a)
         return a, pairs + (row[:, None] & column & counts)
 
     a, pairs = jax.lax.fori_loop(0, m, one_pivot, start_alike((matrix, jnp.zeros_like(matrix)), scale))
@@ -323,7 +323,7 @@ def solve_many(matrix: Matrices, b: np.ndarray) -> np.ndarray:
     if matrix.shape[1] == 1:
         return b / np.where(matrix == 0, np.nan, matrix)
     scaled, scale = unit_diagonal(0.5 * (matrix + np.swapaxes(matrix, 1, 2)))
-    sizes = np.abs(np.linalg.eigvalsh(np.where(_finite(scaled), scaled, 0)))
+    sizes = np.abs(np.linalg.eigvalsh(np.where(_is_free_of_nan(scaled), scaled, 0)))
     regular = sizes.min(axis=1) > singular_threshold(matrix.shape[1], matrix.dtype) * sizes.max(axis=1)
     regular, unit = regular[:, None, None], np.eye(matrix.shape[1], dtype=matrix.dtype)
     x = np.linalg.solve(np.where(regular, scaled, unit), scale[:, :, None] * b)
@@ -338,7 +338,7 @@ def saddle_many(matrix: Matrices, b, jacobian, c) -> tuple[np.ndarray, np.ndarra
     right = b + np.swapaxes(weighted, 1, 2) @ c
     solutions = solve_many(augmented, np.concatenate([right, np.swapaxes(jacobian, 1, 2)], axis=2))
     free, responses = np.split(solutions, [b.shape[2]], axis=2)
-    multipliers = _least_norm_many(jacobian @ responses, c - jacobian @ free)
+    multipliers = _least_norm_batch(jacobian @ responses, c - jacobian @ free)
     return free + responses @ multipliers, multipliers
 
 
@@ -347,10 +347,10 @@ def schur_complements(matrix: Matrices, jacobian: np.ndarray) -> np.ndarray:
     return jacobian @ solve_many(augment(matrix, jacobian)[0], np.swapaxes(jacobian, 1, 2))
 
 
-def _least_norm_many(matrix: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _least_norm_batch(matrix: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The shortest X (S, m, k) with S X = b, as `least_norm`, for S symmetric matrices (S, m, m) of any rank."""
     scaled, scale = unit_diagonal(matrix)
-    finite, scale = _finite(scaled), scale[:, :, None]
+    finite, scale = _is_free_of_nan(scaled), scale[:, :, None]
     values, vectors = np.linalg.eigh(np.where(finite, scaled, np.eye(matrix.shape[1], dtype=matrix.dtype)))
     in_range = np.abs(values) > rank_tolerance(matrix.dtype)
     inverse = np.where(in_range, 1 / np.where(in_range, values, 1), 0)[:, :, None]
@@ -363,6 +363,6 @@ def _least_norm_many(matrix: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.where(finite, x, np.nan)
 
 
-def _finite(matrix: np.ndarray) -> np.ndarray:
+def _is_free_of_nan(matrix: np.ndarray) -> np.ndarray:
     """True for each of S matrices (S, n, n) without a NaN, at which LAPACK raises, (S, 1, 1)."""
     return np.asarray(np.isfinite(matrix).all(axis=(1, 2), keepdims=True))

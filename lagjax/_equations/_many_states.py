@@ -194,7 +194,7 @@ def sparse_spectrum(derivation: Derivation, state: tuple) -> tuple | None:
     form = derivation.form.mass
     if not isinstance(form, Entries):
         return None
-    entries = np.asarray(_entries_of(derivation.motion, form, *state))
+    entries = np.asarray(_mass_entries(derivation.motion, form, *state))
     diagonal = np.abs(entries[form.on_diagonal])
     scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, np.abs(entries).max(initial=0) or 1))
     scaled: Any = csc_array((scale[form.rows] * entries * scale[form.columns], (form.rows, form.columns)))
@@ -216,5 +216,5 @@ def sparse_spectrum(derivation: Derivation, state: tuple) -> tuple | None:
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _entries_of(motion: Motion, form: Entries, *state) -> jax.Array:
+def _mass_entries(motion: Motion, form: Entries, *state) -> jax.Array:
     return form.read(motion.mass_product(*state), state[0].dtype)

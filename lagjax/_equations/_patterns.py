@@ -6,7 +6,7 @@ large scenes alone. A pattern may hold entries that are zero, and must never lac
 
 What asdex is given is written out first: it knows constants by the variables of a jaxpr, and two calls of one compiled
 function share theirs; and it computes whole numbers as NumPy does, not as XLA. What it gives is believed where products
-with the matrix that is read off by it are those of the derivatives (`_reads_all`).
+with the matrix that is read off by it are those of the derivatives (`_verify_pattern`).
 """
 
 import functools
@@ -58,19 +58,19 @@ def jacobian_pattern(function: Callable, shapes: tuple, by: int) -> "scipy.spars
         return function(*jax.tree.unflatten(structure, leaves))
 
     closed = jax.make_jaxpr(flat)(*leaves)
-    if _visited(closed.jaxpr) > _VISITED:
+    if _count_matrix_products(closed.jaxpr) > _VISITED:
         return None
     try:
-        found = asdex.jacobian_sparsity(core.jaxpr_as_fun(_write_out(closed)), *leaves, argnums=by)
+        found = asdex.jacobian_sparsity(core.jaxpr_as_fun(_unroll_calls(closed)), *leaves, argnums=by)
         entries = np.ones(len(found.rows), bool), (np.asarray(found.rows), np.asarray(found.cols))
         pattern = scipy.sparse.csr_array(entries, shape=found.shape)
         with jax.ensure_compile_time_eval():
-            return pattern if _reads_all(pattern, flat, leaves, by) else None
+            return pattern if _verify_pattern(pattern, flat, leaves, by) else None
     except Exception:  # of many kinds, as are the operations that it does not know
         return None
 
 
-def _reads_all(pattern: "scipy.sparse.csr_array", function: Callable, leaves: list, by: int) -> bool:
+def _verify_pattern(pattern: "scipy.sparse.csr_array", function: Callable, leaves: list, by: int) -> bool:
     """True if products with ∂f/∂x as this pattern reads it off are derivatives of f, at two random states."""
     # Rows that are full are read off by products from the left.
     full = bool(np.diff(pattern.indptr).max(initial=0) > _MOST_TESTED)
@@ -91,7 +91,7 @@ def _reads_all(pattern: "scipy.sparse.csr_array", function: Callable, leaves: li
         return jax.lax.map(product, seeds, batch_size=16)
 
     def look(low: float, whole: int) -> np.ndarray:
-        *products, exact = np.asarray(multiply([_draw(rng, x, low, whole) for x in leaves], seeds), float)
+        *products, exact = np.asarray(multiply([_draw_numbers(rng, x, low, whole) for x in leaves], seeds), float)
         values = np.reshape(products, (count, -1))[colors[entries.col], entries.row]
         return differing_rows(values, entries.row, factors[entries.col], exact, dtype)
 
@@ -103,7 +103,7 @@ def _reads_all(pattern: "scipy.sparse.csr_array", function: Callable, leaves: li
     return not (differs(0.3, colors.size) or differs(-1.2, 2))
 
 
-def _draw(rng: np.random.Generator, like: np.ndarray, low: float, whole: int) -> np.ndarray:
+def _draw_numbers(rng: np.random.Generator, like: np.ndarray, low: float, whole: int) -> np.ndarray:
     """Random numbers of a shape and dtype: whole ones below `whole`, others of order one from `low`."""
     if np.issubdtype(like.dtype, np.inexact):
         return rng.uniform(low, 1.2, like.shape).astype(like.dtype)
@@ -123,12 +123,12 @@ def differing_rows(values, rows, factors, exact, dtype, least: float = 0.0) -> n
     return np.abs(exact - sums) > _ROUNDING * np.finfo(dtype).eps * sizes
 
 
-def _write_out(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
+def _unroll_calls(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
     """The same function without calls, every body of a loop its own, and with the numbers that are known."""
-    return _compute_known(jax.make_jaxpr(lambda *x: _run(closed.jaxpr, closed.consts, x))(*closed.in_avals))
+    return _compute_known(jax.make_jaxpr(lambda *x: _evaluate_jaxpr(closed.jaxpr, closed.consts, x))(*closed.in_avals))
 
 
-def _run(jaxpr, constants, arguments) -> list:
+def _evaluate_jaxpr(jaxpr, constants, arguments) -> list:
     values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*constants, *arguments), strict=True))
 
     def read(x):
@@ -138,18 +138,18 @@ def _run(jaxpr, constants, arguments) -> list:
         given, name, params = list(map(read, equation.invars)), equation.primitive.name, equation.params
         if name in _CALLS:
             inner = params[_CALLS[name]]
-            found = _run(*((inner.jaxpr, inner.consts) if hasattr(inner, "consts") else (inner, ())), given)
+            found = _evaluate_jaxpr(*((inner.jaxpr, inner.consts) if hasattr(inner, "consts") else (inner, ())), given)
         else:
             if name in ("scan", "while", "cond"):
-                params = jax.tree.map(_own, params, is_leaf=lambda x: isinstance(x, core.ClosedJaxpr))
+                params = jax.tree.map(_unroll_nested, params, is_leaf=lambda x: isinstance(x, core.ClosedJaxpr))
             found = equation.primitive.bind(*given, **params)
             found = found if equation.primitive.multiple_results else [found]
         values.update(zip(equation.outvars, found, strict=True))
     return list(map(read, jaxpr.outvars))
 
 
-def _own(x):
-    return _write_out(x) if isinstance(x, core.ClosedJaxpr) else x
+def _unroll_nested(x):
+    return _unroll_calls(x) if isinstance(x, core.ClosedJaxpr) else x
 
 
 def _compute_known(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
@@ -233,9 +233,9 @@ def count_operations(jaxpr) -> int:
     return count
 
 
-def _visited(jaxpr) -> int:
+def _count_matrix_products(jaxpr) -> int:
     """The products of two numbers in products of matrices, and the numbers that running sums and transforms read."""
-    count = sum(map(_visited, core.subjaxprs(jaxpr)))
+    count = sum(map(_count_matrix_products, core.subjaxprs(jaxpr)))
     for equation in jaxpr.eqns:
         if equation.primitive.name == "dot_general":
             (contracted, _), _ = equation.params["dimension_numbers"]

@@ -27,7 +27,7 @@ class OwnRules(Exception):
     """A function of a scene has rules of its own for its derivatives, which only JAX can apply."""
 
 
-class _Taped(NamedTuple):
+class _TapedValue(NamedTuple):
     """A value as it is written: a tape, what its scalars are in the graph, which is the value, where inputs are."""
 
     tape: Tape
@@ -66,7 +66,7 @@ class _ScalarState:
         (value,) = self.expansion.run_closed(jaxpr, [*values, *jax.tree.leaves(list(self.ids.values()))])
         return value
 
-    def taped(self, function: Callable) -> "_Taped":
+    def taped(self, function: Callable) -> "_TapedValue":
         """The tape of a function of (q, q̇, t, params) with one value: its operations as written, for `gradient`."""
         tape = Tape(self.expansion.graph.budget, self.expansion.graph.moving)
         written = Expansion(tape)
@@ -75,9 +75,9 @@ class _ScalarState:
         (output,) = written.run_closed(self._traced(function, *self.ids), arguments)
         self.expansion.traced_operations += written.traced_operations
         nodes = copy_nodes(self.expansion.graph, tape, inputs)
-        return _Taped(tape, nodes, int(output), {i: k for k, i in enumerate(inputs)})
+        return _TapedValue(tape, nodes, int(output), {i: k for k, i in enumerate(inputs)})
 
-    def gradient(self, of: "_Taped", *by: str, together: bool = True) -> list[Ids]:
+    def gradient(self, of: "_TapedValue", *by: str, together: bool = True) -> list[Ids]:
         """The derivatives of what is on a tape by each of some of q, qdot and t."""
         inputs = [self.ids[name] for name in by]
         positions = [of.positions[i] for ids in inputs for i in ids.ravel().tolist()]
@@ -136,9 +136,9 @@ def quantities(motion: Motion, expansion: Expansion, shapes: tuple, leaves: list
     state, everything = _ScalarState(expansion, shapes, leaves), ("q", "qdot", "t", "params")
     rates = {"q": state.ids["qdot"], "t": True}
     lagrangian = state.taped(motion.lagrangian)
-    by_q, momentum, by_t, matrix, inertial = _derivatives(state, lagrangian, rates)
+    by_q, momentum, by_t, matrix, inertial = _lagrangian_derivatives(state, lagrangian, rates)
     of_constraints = _constraint_quantities(motion.constraints, state, rates)
-    zero, dissipation, damping = _dissipation(motion, state)
+    zero, dissipation, damping = _dissipation_and_slopes(motion, state)
     if isinstance(motion.forces, CoupledForces):
         free = state.expansion.map("sub", inertial, damping)
         rows = of_constraints["jacobian"], of_constraints["gamma"]
@@ -165,7 +165,7 @@ def quantities(motion: Motion, expansion: Expansion, shapes: tuple, leaves: list
     # Last of all, so that programs of scenes without one are not touched by the search.
     recursion = _shorter_recursion(motion, state, lagrangian, matrix)
     if recursion is not None:
-        result["recursion"] = _entries(state, recursion)
+        result["recursion"] = _entries_of(state, recursion)
     expansion.traced_operations += state.derivatives.operations
     return result, recursion
 
@@ -175,9 +175,9 @@ def quantities(motion: Motion, expansion: Expansion, shapes: tuple, leaves: list
 _ORDERS = 20
 
 
-def _shorter_recursion(motion: Motion, state: _ScalarState, lagrangian: _Taped, matrix: Ids) -> Recursion | None:
+def _shorter_recursion(motion: Motion, state: _ScalarState, lagrangian: _TapedValue, matrix: Ids) -> Recursion | None:
     """The recursion in L, where that takes fewer operations than to eliminate M; two coordinates have Cramer's rule."""
-    if motion.constraints.exist or len(matrix) < 3 or not state.varying(_filled(state, matrix)).any():
+    if motion.constraints.exist or len(matrix) < 3 or not state.varying(_nonzero_scalars(state, matrix)).any():
         return None
     recursion = recursion_of(state.derivatives, int(lagrangian.value), state.ids["qdot"].tolist())
     if recursion is None:
@@ -187,7 +187,7 @@ def _shorter_recursion(motion: Motion, state: _ScalarState, lagrangian: _Taped, 
         return None
     zeros = np.array([graph.value(i) == 0 for i in matrix.ravel().tolist()], bool).reshape(matrix.shape)
     dense = SaddleElimination((zeros, np.zeros((0, len(matrix)), bool)), float, False, False)
-    nodes, entries = matrix[tuple(dense.entries.T)].tolist(), _entries(state, recursion).tolist()
+    nodes, entries = matrix[tuple(dense.entries.T)].tolist(), _entries_of(state, recursion).tolist()
     costs = (
         _cost(state, entries, sparse.entries, *sparse.operations([graph.value(i) for i in entries])),
         _cost(state, nodes, dense.entries, dense.operations, dense.solution_operations),
@@ -202,7 +202,7 @@ def _cost(state: _ScalarState, nodes: list[int], places, operations: int, soluti
     return operations, operations + _ORDERS * (solution + (2 + _ORDERS / 2) * float(sums))
 
 
-def _entries(state: _ScalarState, recursion: Recursion) -> Ids:
+def _entries_of(state: _ScalarState, recursion: Recursion) -> Ids:
     minus = state.expansion.graph.constant(-1.0, "float")
     return np.array([minus if i is None else i for i in recursion.entries.values()])
 
@@ -218,12 +218,12 @@ def unbalanced_force(motion: Motion, expansion: Expansion, shapes: tuple, leaves
         return (force := expansion.map("sub", rate, by_q)), force
 
     inertial, _ = _derive_shorter(state, lagrangian, derive)
-    _, _, damping = _dissipation(motion, state)
+    _, _, damping = _dissipation_and_slopes(motion, state)
     given = None if motion.forces is None else state.evaluate(motion.forces, *state.ids)
     return expansion.map("add", inertial if given is None else expansion.map("sub", inertial, given), damping)
 
 
-def _dissipation(motion: Motion, state: _ScalarState) -> tuple[Ids, Ids, Ids]:
+def _dissipation_and_slopes(motion: Motion, state: _ScalarState) -> tuple[Ids, Ids, Ids]:
     """Zeros (n,), the dissipation (1,), or (0,) without one, and its derivatives by q̇ (n,)."""
     zero = state.zeros(state.ids["q"].shape)
     if motion.dissipation is None:
@@ -239,7 +239,9 @@ _APART = 5000
 _SHORTER = 0.97
 
 
-def _derivatives(state: _ScalarState, lagrangian: _Taped, rates: dict) -> tuple[Ids, Ids, Ids, Ids, Ids]:
+def _lagrangian_derivatives(
+    state: _ScalarState, lagrangian: _TapedValue, rates: dict
+) -> tuple[Ids, Ids, Ids, Ids, Ids]:
     """∂L/∂q, p, ∂L/∂t, M, and ∂L/∂q − (∂p/∂q) q̇ − ∂p/∂t, in the form that takes fewer operations."""
 
     def derive(together: bool) -> tuple[tuple, Ids]:
@@ -249,12 +251,12 @@ def _derivatives(state: _ScalarState, lagrangian: _Taped, rates: dict) -> tuple[
         i, j = np.maximum(i, j), np.minimum(i, j)
         matrix[j, i] = matrix[i, j]
         inertial = state.expansion.map("sub", by_q, state.rate(momentum, **rates))
-        return (by_q, momentum, by_t, matrix, inertial), np.append(_filled(state, matrix), inertial)
+        return (by_q, momentum, by_t, matrix, inertial), np.append(_nonzero_scalars(state, matrix), inertial)
 
     return _derive_shorter(state, lagrangian, derive)[0]
 
 
-def _derive_shorter(state: _ScalarState, lagrangian: _Taped, derive: Callable[[bool], tuple[Any, Ids]]) -> tuple:
+def _derive_shorter(state: _ScalarState, lagrangian: _TapedValue, derive: Callable[[bool], tuple[Any, Ids]]) -> tuple:
     """A derivation and the scalars that it consists of, by `derive(together)`: the form that takes fewer operations."""
     # In a kinetic energy of rotations the terms of ∂L/∂q cancel with those of (∂p/∂q) q̇. Where the cotangents of equal
     # scalars are added up at once, that is not seen: where cos q is in the kinetic and in the potential energy, one
@@ -266,7 +268,7 @@ def _derive_shorter(state: _ScalarState, lagrangian: _Taped, derive: Callable[[b
     return forms[0] if sizes[0] < _SHORTER * sizes[-1] else forms[-1]
 
 
-def _filled(state: _ScalarState, matrix: Ids) -> Ids:
+def _nonzero_scalars(state: _ScalarState, matrix: Ids) -> Ids:
     """The scalars of a matrix that are not zero."""
     return matrix[matrix != state.zeros(())]
 

@@ -61,7 +61,7 @@ def recursion_of(derivatives: Derivatives, value: int, qdot: Sequence[int]) -> R
     frontier = sorted({x for i in curved for x in derivatives.node_to_differentiate(i)[1] if x in linear})
     if not any(uses[i] > 1 for i in linear):
         return None
-    hessian = _hessian(derivatives, value, curved, frontier)
+    hessian = _frontier_hessian(derivatives, value, curved, frontier)
     unknowns = _AffineNodes(graph, qdot, {i for i, j in hessian if i == j}, uses)
     for i, terms in linear.items():
         unknowns.add(i, terms)
@@ -80,7 +80,7 @@ def _linear_nodes(derivatives: Derivatives, below: Iterable[int], qdot: Sequence
         moving = [x for x in operands if x in linear or x in curved]
         if not moving or i in linear:
             continue
-        terms = None if any(x in curved for x in moving) else _terms(derivatives.graph, op, operands, linear)
+        terms = None if any(x in curved for x in moving) else _affine_terms(derivatives.graph, op, operands, linear)
         if terms is None:
             curved[i] = None
         else:
@@ -92,7 +92,7 @@ def _linear_nodes(derivatives: Derivatives, below: Iterable[int], qdot: Sequence
     return linear, curved, uses
 
 
-def _terms(graph: Graph, op: str, operands: Sequence[int], linear) -> list[tuple[int, int]] | None:
+def _affine_terms(graph: Graph, op: str, operands: Sequence[int], linear) -> list[tuple[int, int]] | None:
     """A node as a sum of nodes that are affine in q̇, each with a factor, and of others; None where it is not one."""
     one, minus = (graph.constant(x, "float") for x in (1.0, -1.0))
     if op == "neg":
@@ -108,7 +108,7 @@ def _terms(graph: Graph, op: str, operands: Sequence[int], linear) -> list[tuple
     return None
 
 
-def _hessian(derivatives: Derivatives, value: int, curved: Iterable[int], frontier: list[int]):
+def _frontier_hessian(derivatives: Derivatives, value: int, curved: Iterable[int], frontier: list[int]):
     """The second derivatives of L by the nodes of a frontier, on and below the diagonal, as nodes of the graph."""
     # In a graph of its own these nodes are inputs: where L is, a product with one of them may be known as another
     # product, in which it no longer appears.
@@ -158,7 +158,7 @@ class _AffineNodes:
         form: Form = {}
         for x, factor in terms:
             for u, c in self._forms[x].items():
-                _add(self._graph, form, u, self._graph.apply("mul", c, factor))
+                _add_to_sum(self._graph, form, u, self._graph.apply("mul", c, factor))
         form = {u: c for u, c in form.items() if self._graph.value(c) != 0}
         if len(form) > 1 and (i in self._energetic or self._uses[i] > 1):
             self.definitions.append(form)
@@ -175,15 +175,15 @@ class _AffineNodes:
                     part = apply("mul", apply("mul", c, d), node)
                     if u == v and a != b:
                         part = apply("mul", self._graph.constant(2.0, "float"), part)
-                    _add(self._graph, result, _pair(u, v), part)
+                    _add_to_sum(self._graph, result, _ordered_pair(u, v), part)
         return {pair: node for pair, node in result.items() if self._graph.value(node) != 0}
 
 
-def _add(graph: Graph, sums: dict, key, part: int) -> None:
+def _add_to_sum(graph: Graph, sums: dict, key, part: int) -> None:
     sums[key] = graph.apply("add", sums[key], part) if key in sums else part
 
 
-def _pair(u: int, v: int) -> tuple[int, int]:
+def _ordered_pair(u: int, v: int) -> tuple[int, int]:
     return (u, v) if u > v else (v, u)
 
 
@@ -193,7 +193,7 @@ def _pair(u: int, v: int) -> tuple[int, int]:
 _LARGEST_COUNT = 10_000_000  # operations that are counted
 
 
-class _Step(NamedTuple):
+class _EliminationStep(NamedTuple):
     """The eliminated unknown, the unknowns that define it (none: a coordinate), and all others that it meets then."""
 
     unknown: int
@@ -242,7 +242,7 @@ class RecursiveElimination:
 
     def factors(self, values: Scalars) -> tuple[Any, Any]:
         """The factors that `solve` needs, a tree of vectors, and whether a pivot was lost."""
-        work = _Elimination(self, values)
+        work = _EnergyElimination(self, values)
         for step in self.steps:
             work.velocity(step) if step.terms else work.coordinate(step)
         return Scalars(values.expansion, np.array(work.factors)), Scalars(values.expansion, np.array(work.lost))
@@ -281,7 +281,7 @@ class RecursiveElimination:
         return Scalars(right.expansion, np.array(z))
 
 
-class _Elimination:
+class _EnergyElimination:
     """The entries of the energy while unknowns are eliminated, nodes of a graph."""
 
     def __init__(self, elimination: RecursiveElimination, values: Scalars):
@@ -303,37 +303,37 @@ class _Elimination:
         # Lost pivots are recognised by what the diagonal would be if nothing had been taken off.
         self._sizes = {u: node for (u, v), node in self._energy.items() if u == v}
 
-    def _add(self, sums: dict, key, a: int, b: int) -> None:
+    def _add_to_sum(self, sums: dict, key, a: int, b: int) -> None:
         """Add a product to the sum under a key."""
-        _add(self._graph, sums, key, self._apply("mul", a, b))
+        _add_to_sum(self._graph, sums, key, self._apply("mul", a, b))
 
-    def velocity(self, step: _Step) -> None:
+    def velocity(self, step: _EliminationStep) -> None:
         """Put its definition, Σ c u, in the place of a velocity w: r w + ½ h w² becomes Σ c u r + ½ h (Σ c u)²."""
         w, definition = step.unknown, self._definitions[step.unknown]
         own = self._energy.pop((w, w), None)
-        coupled = {u: self._energy.pop(_pair(w, u)) for u in step.others if _pair(w, u) in self._energy}
+        coupled = {u: self._energy.pop(_ordered_pair(w, u)) for u in step.others if _ordered_pair(w, u) in self._energy}
         sums = dict(coupled)
         if own is not None:
             for u in step.terms:
-                self._add(sums, u, own, definition[u])
+                self._add_to_sum(sums, u, own, definition[u])
         for k, u in enumerate(step.others):
             for v in step.others[: k + 1]:
                 first, second = (u, v) if u in definition else (v, u)
                 if first not in definition:
                     continue
                 if second in sums:
-                    self._add(self._energy, _pair(u, v), definition[first], sums[second])
+                    self._add_to_sum(self._energy, _ordered_pair(u, v), definition[first], sums[second])
                 if second in definition and first in coupled:
-                    self._add(self._energy, _pair(u, v), definition[second], coupled[first])
+                    self._add_to_sum(self._energy, _ordered_pair(u, v), definition[second], coupled[first])
         if (size := self._sizes.pop(w, None)) is not None:
             for u in step.terms:
-                self._add(self._sizes, u, self._apply("mul", definition[u], definition[u]), size)
+                self._add_to_sum(self._sizes, u, self._apply("mul", definition[u], definition[u]), size)
         zero = self._number(0.0)
         self.factors += [definition[u] for u in step.terms]
         self.factors += [sums[u] if u in sums else zero for u in step.others]
         self.factors.append(zero if own is None else own)
 
-    def coordinate(self, step: _Step) -> None:
+    def coordinate(self, step: _EliminationStep) -> None:
         """Let a coordinate move freely: what is left of the energy is its least value for all its velocities."""
         x, size = step.unknown, self._sizes.pop(step.unknown)
         pivot = self._energy.pop((x, x))
@@ -341,17 +341,17 @@ class _Elimination:
         lost = self._apply("le", pivot, least)
         self.lost = self._apply("or", self.lost, lost)
         inverse = self._apply("div", self._number(1.0), self._apply("select", lost, pivot, self._number(np.nan)))
-        column = [self._energy.pop(_pair(x, u)) for u in step.others]
+        column = [self._energy.pop(_ordered_pair(x, u)) for u in step.others]
         lower = [self._apply("mul", a, inverse) for a in column]
         for k, (u, a) in enumerate(zip(step.others, column, strict=True)):
             for v, b in zip(step.others[: k + 1], lower, strict=False):
-                pair = _pair(u, v)
+                pair = _ordered_pair(u, v)
                 taken, before = self._apply("mul", a, b), self._energy.get(pair)
                 self._energy[pair] = self._apply(*(("neg", taken) if before is None else ("sub", before, taken)))
         self.factors += [*lower, inverse]
 
 
-def _steps(size: int, terms: list[set[int]], energy: set[tuple[int, int]]) -> Iterator[_Step]:
+def _steps(size: int, terms: list[set[int]], energy: set[tuple[int, int]]) -> Iterator[_EliminationStep]:
     """The order of elimination: of what may be eliminated, that which meets the fewest others."""
     # Ends early at a coordinate without energy, whose pivot would be zero, or with none but that of products of
     # different velocities: nothing then tells how large its pivot should be.
@@ -381,11 +381,11 @@ def _steps(size: int, terms: list[set[int]], energy: set[tuple[int, int]]) -> It
         own = tuple(sorted(terms[x - size])) if x >= size else ()
         if not own and x not in sized:
             return
-        yield _Step(x, own, tuple(sorted(now)))
+        yield _EliminationStep(x, own, tuple(sorted(now)))
         done.add(x)
         if x in sized:
             sized.update(own)
-        _fill(x, own, now, others, moving)
+        _fill_in(x, own, now, others, moving)
         for u in own:
             waiting[u] -= 1
         for u in now:
@@ -393,7 +393,7 @@ def _steps(size: int, terms: list[set[int]], energy: set[tuple[int, int]]) -> It
                 heapq.heappush(ready, (len(met(u)), -u))
 
 
-def _fill(x: int, terms: Sequence[int], now: set[int], others: list[set[int]], moving: set[int]) -> None:
+def _fill_in(x: int, terms: Sequence[int], now: set[int], others: list[set[int]], moving: set[int]) -> None:
     """The entries of the energy that are no longer zero once x is eliminated."""
     coupled = others[x] - {x}
     for u in now:

@@ -70,9 +70,9 @@ class SaddleElimination:
             mass = mass | ((touched.T.astype(float) @ touched.astype(float)) > 0)
         self.order, filled = elimination_order(mass, touched)
         self.massless = ~np.diagonal(mass)
-        self._place_all(filled)
+        self._place_entries(filled)
 
-    def _place_all(self, filled: np.ndarray) -> None:
+    def _place_entries(self, filled: np.ndarray) -> None:
         """The places in a vector of the entries of A on and below its diagonal: the diagonal, then L by columns."""
         total, place = len(self.order), np.argsort(self.order)
         self.slots = np.full((total, total), -1, np.int32)
@@ -103,10 +103,10 @@ class SaddleElimination:
             # The constraints would have to hold a light coordinate against forces on heavy ones.
             diagonal = a[: self.size]
             singular = xp.fold("min", diagonal) <= REGULAR * xp.fold("max", diagonal)
-        lower, inverse, lost = self._eliminate(a)
+        lower, inverse, lost = self._factor_lower(a)
         return (weighted, lower, inverse), lost if singular is None else singular | lost
 
-    def _eliminate(self, a) -> tuple[Any, Any, Any]:
+    def _factor_lower(self, a) -> tuple[Any, Any, Any]:
         """L in the order of the pivots, D⁻¹, and whether a pivot was lost to round-off."""
         n, total = self.size, len(self.order)
         # What coordinates take off the diagonal, and what constraints do: in a constraint the two must stay separate.

@@ -46,10 +46,10 @@ class Scales(NamedTuple):
         q, qdot = np.asarray(q, float), np.asarray(qdot, float)
         with np.errstate(all="ignore"):
             mass = np.diagonal(evaluate("mass_matrix", q[None], qdot[None])[0])
-            return _measure(evaluate, np.sqrt(np.abs(mass)), q, qdot)
+            return _measure_scales(evaluate, np.sqrt(np.abs(mass)), q, qdot)
 
 
-def _measure(evaluate, root: Numbers, q: Numbers, qdot: Numbers) -> Scales:
+def _measure_scales(evaluate, root: Numbers, q: Numbers, qdot: Numbers) -> Scales:
     heaviest = root.max(where=np.isfinite(root), initial=0.0) or 1.0
     root = np.where((root > 0) & np.isfinite(root), root, heaviest)
     along = np.cos(np.arange(1.0, len(q) + 1)) / root  # no symmetry moves all coordinates like this
@@ -61,12 +61,12 @@ def _measure(evaluate, root: Numbers, q: Numbers, qdot: Numbers) -> Scales:
 
     far, fast = np.abs(q * root).max(), np.abs(qdot * root).max()
     steps = far * _STEPS if far > 0 else _ALL_STEPS
-    slope, bent = _line(lambda s: moved("force", s, along, 0.0), steps)
+    slope, bent = _linear_range(lambda s: moved("force", s, along, 0.0), steps)
     here = float(np.nan_to_num(np.abs(moved("force", [0.0], along, 0.0)).max()))
     swing = fast / np.sqrt(slope) if slope > 0 else 0.0
     length = max(far, min(swing, bent or np.inf)) or bent or (here / slope if slope > 0 else 0.0)
     if not length and here > 0:
-        limit = fast or _line(lambda s: moved("momentum", s, 0.0, along), _ALL_STEPS)[1]
+        limit = fast or _linear_range(lambda s: moved("momentum", s, 0.0, along), _ALL_STEPS)[1]
         length = limit**2 / here
     length = length or heaviest
     rate = max(fast / length, np.sqrt(slope))
@@ -77,9 +77,9 @@ def _measure(evaluate, root: Numbers, q: Numbers, qdot: Numbers) -> Scales:
     return Scales(np.maximum(np.abs(q), length / root), np.maximum(np.abs(qdot), rate * length / root), 1 / rate, reach)
 
 
-def _line(force: Callable, steps: np.ndarray) -> tuple[float, float]:
+def _linear_range(force: Callable, steps: np.ndarray) -> tuple[float, float]:
     """∂F/∂ε along a line, and the smallest step at which F is not linear; 0 where there is none."""
-    linear, bent, change = _bends(force, steps)
+    linear, bent, change = _bracket_nonlinearity(force, steps)
     if not linear.any():  # a jump or a power, which are the same at all scales
         return 0.0, 0.0
     first = int(np.argmax(linear))
@@ -90,7 +90,7 @@ def _line(force: Callable, steps: np.ndarray) -> tuple[float, float]:
     low, high = float(steps[beyond - 1]), float(steps[beyond])
     for _ in range(_ROUNDS):  # so that it follows the units to the last digits
         between = np.geomspace(low, high, _BETWEEN)
-        bent = _bends(force, between)[1]
+        bent = _bracket_nonlinearity(force, between)[1]
         beyond = int(np.argmax(bent)) if bent[1:].any() else _BETWEEN - 1
         low, high = float(between[max(0, beyond - 1)]), float(between[beyond])
     return slope, high
@@ -100,7 +100,7 @@ def _line(force: Callable, steps: np.ndarray) -> tuple[float, float]:
 _ROUNDS, _BETWEEN = 8, 25
 
 
-def _bends(force: Callable, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _bracket_nonlinearity(force: Callable, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The steps up to which F is linear, those where it is not, and its change."""
     ahead, back, twice, twice_back, here = (force(x) for x in (steps, -steps, 2 * steps, -2 * steps, np.zeros(1)))
     odd, even = (ahead - back) / 2, (ahead + back) / 2 - here

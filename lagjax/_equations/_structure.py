@@ -96,14 +96,14 @@ class SparseMotion(Motion):
     def saddle(self, b: Vector, c: Row, q, qdot, t, params, positions=False) -> tuple[Vector, Row, Flag]:
         """x, λ of M x − Gᵀλ = b, G x = c, and whether M is singular; of f alone for `positions`."""
         positions = positions and self.constraints.on_velocities is not None
-        return _saddle_of(self, positions)(b, c, q, qdot, t, params)
+        return _compile_saddle(self, positions)(b, c, q, qdot, t, params)
 
-    def _prepare(self, positions: bool, *state, products=None) -> tuple[Solver, Solver, Callable]:
+    def _prepare_solvers(self, positions: bool, *state, products=None) -> tuple[Solver, Solver, Callable]:
         """The solvers of M and of S, and (b, c) ↦ (x, −λ), of G with these `products`, x ↦ G x and λ ↦ Gᵀλ."""
         dtype = state[0].dtype
         push, pull = self.constraints.products(*state, positions=positions) if products is None else products
         mass = self.structure.mass.prepare(self.mass_product(*state), dtype)
-        form = self._form(positions)
+        form = self._schur_form(positions)
         schur = form.prepare(lambda y: push(mass.solve(pull(y))), dtype, dependent=True)
 
         def eliminate(b, c):
@@ -113,7 +113,7 @@ class SparseMotion(Motion):
 
         return mass, schur, eliminate
 
-    def _form(self, positions: bool) -> MatrixForm:
+    def _schur_form(self, positions: bool) -> MatrixForm:
         """The form of S, or of S for the constraints on `positions` alone."""
         form = self.structure.positions if positions else self.structure.schur
         assert form is not None
@@ -123,7 +123,7 @@ class SparseMotion(Motion):
         """True if fewer constraints are independent at `end` than at `start`; where S is banded or in blocks."""
         (t0, t1), numbers = (jnp.asarray(state[2]) for state in (start, end)), start[3]
         states = jax.lax.stop_gradient(jax.tree.map(lambda *x: jnp.stack(x), (*start[:2], t0), (*end[:2], t1)))
-        before, after = jax.lax.map(lambda y: self._prepare(False, *y, numbers)[1].rank, states)
+        before, after = jax.lax.map(lambda y: self._prepare_solvers(False, *y, numbers)[1].rank, states)
         return after < before
 
     def unit(self, q, qdot, t, params):
@@ -132,7 +132,7 @@ class SparseMotion(Motion):
 
     def row_lengths(self, unit, q, qdot, t, params, positions=False):
         push, pull = self.constraints.products(q, qdot, t, params, positions=positions)
-        form = self._form(positions)
+        form = self._schur_form(positions)
         return jnp.sqrt(form.diagonal(lambda y: push(unit**2 * pull(y)), q.dtype))
 
     def quantities(self, q, qdot, t, params):
@@ -171,7 +171,7 @@ class SparseMotion(Motion):
         """(x, ν) with H x + Jᵀν = b, J x = c, by GMRES, preconditioned by solves with M in the place of H."""
         zero = jax.tree.map(jnp.zeros_like, right)
         products = lambda x: linear((x, zero[1]))[1], lambda nu: linear((zero[0], nu))[0]
-        eliminate = self._prepare(True, *jax.lax.stop_gradient(state), products=products)[2]
+        eliminate = self._prepare_solvers(True, *jax.lax.stop_gradient(state), products=products)[2]
 
         def solve(_, right):
             tolerance, prepare = 10 * float(jnp.finfo(state[0].dtype).eps), lambda rest: eliminate(*rest)
@@ -182,11 +182,11 @@ class SparseMotion(Motion):
 
 
 @functools.lru_cache(maxsize=64)
-def _saddle_of(motion: SparseMotion, positions: bool) -> Callable:
+def _compile_saddle(motion: SparseMotion, positions: bool) -> Callable:
     """`SparseMotion.saddle` as a compiled function of b, c and the state, in two rounds."""
 
     def saddle(b: Vector, c: Row, *state):
-        mass, _, eliminate = motion._prepare(positions, *jax.lax.stop_gradient(state))
+        mass, _, eliminate = motion._prepare_solvers(positions, *jax.lax.stop_gradient(state))
         multiply, (push, pull) = motion.mass_product(*state), motion.constraints.products(*state, positions=positions)
 
         def product(place):

@@ -37,7 +37,7 @@ def end(scene):
 @pytest.fixture
 def derived(monkeypatch):
     """The derivations that are made, one by one."""
-    made, real = [], _derivation._derived
+    made, real = [], _derivation._derive_structure
 
     def counted(key, unhashable=None):
         made.append(key)

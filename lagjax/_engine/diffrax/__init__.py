@@ -53,7 +53,7 @@ from lagjax._program import Unlowerable, lack_of_memory, table_of
 LEAST_RTOL_OF_DIFFRAX = 10
 
 
-def _explains_forward_mode(solve):
+def _explain_forward_mode(solve):
     """Solutions that say what forward mode through recorded steps needs, where JAX would name a `custom_vjp`."""
 
     @functools.wraps(solve)
@@ -146,21 +146,21 @@ class Diffrax(AbstractEngine, eqx.Module):
         batch = f"{members} members of " if members > 1 else ""
         return lack and f"A motion of {batch}{n} coordinates with {count} outputs {lack}"
 
-    @_explains_forward_mode
+    @_explain_forward_mode
     def solve(self, problem: Problem) -> Solution:
         """The motion of one member, compiled once for all problems of its structure."""
         motion = problem.derivation.motion
         if problem.is_single and motion.constrained and problem.derivation.form.is_sparse:
             return solve_in_doubles(self.solve, problem)  # many links are as large as the roundings of float32
-        return _solve(self, problem)
+        return _solve_problem(self, problem)
 
-    @_explains_forward_mode
+    @_explain_forward_mode
     @eqx.filter_jit
     def solve_batch(self, batch: Batch) -> Solution:
         """The motions of all members, which step together until the slowest has arrived; of large scenes in turn."""
         if batch.member.derivation.form.is_sparse:  # one by one they are in the caches of a core
             return batch.map_in_turn(self.solve)
-        solution = batch.map_members(lambda problem: _solve(self, problem))
+        solution = batch.map_members(lambda problem: _solve_problem(self, problem))
         steps = solution.accepted + solution.rejected
         return solution._replace(idle=steps.size * jnp.max(steps) - jnp.sum(steps))
 
@@ -177,7 +177,7 @@ class Diffrax(AbstractEngine, eqx.Module):
         # Below this a step no longer moves the time reliably.
         smallest = 4 * jnp.finfo(dtype).eps * jnp.maximum(abs(ts[0]), abs(ts[-1]))
         controller = diffrax.PIDController(*tolerances, norm=_norm_or_inf, dtmin=smallest, force_dtmin=False)
-        if (jumps := _jumps(problem)) is not None:
+        if (jumps := _table_jump_times(problem)) is not None:
             controller = WithJumps(controller, jumps)
         return Method(solver, controller, None, problem.max_steps, self.progress, jumps)
 
@@ -187,7 +187,7 @@ _STATES = 20  # that a step of Dopri8 holds: its stages, their sums, and errors
 _AT_END = 256  # diffrax lets a step that ends up to 100 roundings before the end of the motion end there
 
 
-def _jumps(problem: Problem) -> Jumps | None:
+def _table_jump_times(problem: Problem) -> Jumps | None:
     """The times inside the motion at which its program looks up another entry of a table; None without any.
 
     One at an end of the motion is moved inside by some roundings, so that only one tiny step sees it.
@@ -218,12 +218,12 @@ def _norm_or_inf(error: PyTree) -> jax.Array:
 
 
 @eqx.filter_jit
-def _solve(engine: Diffrax, problem: Problem) -> Solution:
+def _solve_problem(engine: Diffrax, problem: Problem) -> Solution:
     derivation, numbers, given = problem.derivation, problem.numbers, jnp.asarray(problem.ts)
     form, y0 = equations_of(derivation), jnp.asarray(problem.y0)
 
     # A member that cannot start is given no time to integrate over: it costs nothing, and the others do not wait.
-    start = _state_result(y0, *form.acceleration(*freeze((given[0], halves(y0), numbers))))
+    start = _check_acceleration(y0, *form.acceleration(*freeze((given[0], halves(y0), numbers))))
     ts = jnp.where(start == RESULTS.successful, given, given[0])
     event, is_located = (None, True) if problem.event is None else _flatten_event(problem, ts, y0, numbers)
     method = engine.method(problem)
@@ -257,7 +257,7 @@ def _solve(engine: Diffrax, problem: Problem) -> Solution:
 # ---- what stopped a motion -------------------------------------------------------------------------------------------
 
 
-def _state_result(y, acceleration, singular) -> RESULTS:
+def _check_acceleration(y, acceleration, singular) -> RESULTS:
     """The result code of a motion from a state with this acceleration: successful if it can go on."""
     finite = jnp.isfinite(y).all() & jnp.isfinite(acceleration).all()
     failed = jnp.where(singular, code_of(RESULTS.mass_matrix_singular), code_of(RESULTS.nonfinite_state))
@@ -269,7 +269,7 @@ def _explain_result(solution: Solution, form: MotionEquations, start: RESULTS, t
     # A name has no derivative, and the search for it is a loop that reverse mode could not go back through.
     ts, solution, numbers = freeze((ts, solution, numbers))
     last = halves(solution.y_end)
-    end = _state_result(solution.y_end, *form.acceleration(solution.t_end, last, numbers))
+    end = _check_acceleration(solution.y_end, *form.acceleration(solution.t_end, last, numbers))
     result = result_from(solution.result)
     stopped = (result != RESULTS.successful) & (result != RESULTS.event_occurred)
     unhealthy = (end != RESULTS.successful) & (stopped | (end == RESULTS.nonfinite_state))

@@ -41,12 +41,12 @@ class MotionEquations(eqx.Module):
         """The equations by programs of q, q̇, t and every number in params: `Accelerations.program`, `projected`."""
 
         def accelerate(q, qdot, t, params):
-            *acceleration, singular = program(*q, *qdot, t, *_scalars(params))
+            *acceleration, singular = program(*q, *qdot, t, *_scalar_equations(params))
             return jnp.stack(acceleration), singular
 
         def project(q, qdot, t, params):
             assert projection is not None
-            return halves(jnp.stack(projection(*q, *qdot, t, *_scalars(params))))
+            return halves(jnp.stack(projection(*q, *qdot, t, *_scalar_equations(params))))
 
         return cls(motion, compiled_once(accelerate), compiled_once(project))
 
@@ -69,5 +69,5 @@ def equations_of(derivation: Derivation) -> MotionEquations:
     return MotionEquations.from_programs(derivation.motion, of.program.complete, of.projected)
 
 
-def _scalars(params: PyTree) -> list[jax.Array]:
+def _scalar_equations(params: PyTree) -> list[jax.Array]:
     return [x for leaf in jax.tree.leaves(params) for x in ([leaf] if jnp.ndim(leaf) == 0 else jnp.ravel(leaf))]

@@ -86,21 +86,21 @@ def integrate(form: MotionEquations, method: Method, adjoint, event, ts, y0, par
     field = Converted.from_function(vector_field, ts[0], y0, params)
     project = Converted.from_function(projected, ts[0], y0, params) if form.constrained else None
     jumps = functools.partial(may_jump, form.motion)
-    solution = _differentiable((field, project, ts, y0, params), method, jumps, adjoint, event)
+    solution = _integrate_differentiably((field, project, ts, y0, params), method, jumps, adjoint, event)
     if project is not None:
         path = jax.lax.map(lambda at: project(*at, params), (ts, solution.path))
         solution = solution._replace(path=path)
     return solution
 
 
-def _differentiable(moving, method: Method, jumps: Callable, adjoint, event) -> Solution:
+def _integrate_differentiably(moving, method: Method, jumps: Callable, adjoint, event) -> Solution:
     if adjoint is not None or event is not None:
         adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
         _, _, ts, y0, params = moving
         if isinstance(adjoint, diffrax.BacksolveAdjoint) or not jumps(ts[0], y0, params):
-            return _call(moving, method, adjoint, event)[0]
+            return _call_diffrax(moving, method, adjoint, event)[0]
         # It is not known here by what this will be differentiated: parameters count as fixed.
-        solution, _, crossed = _call(moving, _note_jumps(moving, method, None), adjoint, event)
+        solution, _, crossed = _call_diffrax(moving, _note_jumps(moving, method, None), adjoint, event)
         y_end, path = (differentiable_where(~crossed, x) for x in (solution.y_end, solution.path))
         return solution._replace(path=path, y_end=y_end)
     # Tolerances and the smallest step follow from ts and the dtype; like all that sizes a step, they are data here.
@@ -116,7 +116,7 @@ def _note_jumps(moving, method: Method, varied) -> Method:
     return eqx.tree_at(lambda m: m.controller, method, noting(method.controller, field, varied))
 
 
-def _call(moving, method: Method, adjoint, event=None, *more: diffrax.SubSaveAt) -> tuple[Solution, Any, Any]:
+def _call_diffrax(moving, method: Method, adjoint, event=None, *more: diffrax.SubSaveAt) -> tuple[Solution, Any, Any]:
     """The solution, what `more` diffrax saves, and whether a step crossed a jump, where that is noted."""
     field, project, ts, y0, params = moving
     solver = method.solver if project is None else Projected(method.solver, project)
@@ -174,18 +174,18 @@ def _set_stage_loop(solver, adjoint):
 @eqx.filter_custom_vjp
 def _solve_and_record(moving, method, jumps):
     """The solution by the plain loop, `diffrax.ForwardMode`, which keeps nothing; reverse mode replays its steps."""
-    return _call(moving, method, diffrax.ForwardMode())[0]
+    return _call_diffrax(moving, method, diffrax.ForwardMode())[0]
 
 
 @_solve_and_record.def_fwd
-def _forward(perturbed, moving, method, jumps):
+def _integrate_and_record(perturbed, moving, method, jumps):
     record = diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: t)
     of_field, _, _, of_start, of_params = perturbed
     varied = of_field, of_params
     _, _, ts, y0, params = moving
     if any(jax.tree.leaves((varied, of_start))) and jumps(ts[0], y0, params):
         method = _note_jumps(moving, method, varied)
-    solution, (times,), crossed = _call(moving, method, diffrax.ForwardMode(), None, record)
+    solution, (times,), crossed = _call_diffrax(moving, method, diffrax.ForwardMode(), None, record)
     residuals = times, solution.t_end, solution.result, crossed
     well = jnp.isin(solution.result, jnp.asarray(ENDED_WELL, solution.result.dtype))
     lost = jnp.asarray(code_of(RESULTS.derivatives_lost), solution.result.dtype)
@@ -193,7 +193,7 @@ def _forward(perturbed, moving, method, jumps):
 
 
 @_solve_and_record.def_bwd
-def _backward(residuals, cotangents, perturbed, moving, method, jumps):
+def _replay_backward(residuals, cotangents, perturbed, moving, method, jumps):
     times, t_end, result, crossed = residuals
 
     def replay(moving):
@@ -205,7 +205,7 @@ def _backward(residuals, cotangents, perturbed, moving, method, jumps):
         # The last step ends at ts[-1] itself, which may be differentiated, not at its recorded value.
         controller = _RecordedSteps(jnp.where(times == t_end, jnp.inf, times), method.jumps)
         again = Method(method.solver, controller, None, method.max_steps, diffrax.NoProgressMeter())
-        solution, *_ = _call((field, project, ts, y0, params), again, _checkpoints(y0, method.max_steps))
+        solution, *_ = _call_diffrax((field, project, ts, y0, params), again, _checkpoint_count(y0, method.max_steps))
         return solution[:3]
 
     replayed, pull_back = eqx.filter_vjp(replay, moving)
@@ -217,7 +217,7 @@ def _backward(residuals, cotangents, perturbed, moving, method, jumps):
 _CHECKPOINT_BYTES = 2**28  # of states that a gradient keeps; half of it lets each step be taken once more, at most
 
 
-def _checkpoints(y0, max_steps: int) -> diffrax.RecursiveCheckpointAdjoint:
+def _checkpoint_count(y0, max_steps: int) -> diffrax.RecursiveCheckpointAdjoint:
     """Checkpoints as diffrax has them, some √(2 max_steps), but of a large state as many as fit."""
     usual, fit = int(np.ceil(np.sqrt(2 * max_steps))), _CHECKPOINT_BYTES // (y0.size * y0.dtype.itemsize)
     return diffrax.RecursiveCheckpointAdjoint(checkpoints=None if usual <= fit else max(fit, 2))
@@ -233,7 +233,7 @@ class _RecordedSteps(diffrax.AbstractStepSizeController):
         times = jnp.where(jnp.isinf(self.times), jnp.inf, self.times * direction)
         jumps = self.jumps and self.jumps.reversed(direction)
         if jumps is not None:  # what is recorded of a step is where the next one begins
-            times = _exchange(times, jumps.behind, jumps.before)
+            times = _exchange_times(times, jumps.behind, jumps.before)
         return _RecordedSteps(times, jumps)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
@@ -273,7 +273,7 @@ class Jumps(eqx.Module):
 
     def next_start(self, t):
         """The time at which the step after one that ended at t begins, and whether that is behind a jump."""
-        begin = _exchange(t, self.before, self.behind)
+        begin = _exchange_times(t, self.before, self.behind)
         return begin, begin != t
 
     def first(self, begin, end):
@@ -282,7 +282,7 @@ class Jumps(eqx.Module):
         return jnp.minimum(end, self.before.at[ahead].get(mode="fill", fill_value=jnp.inf))
 
 
-def _exchange(t, old, new):
+def _exchange_times(t, old, new):
     """The times t, where those that occur in `old`, in increasing order, are replaced by their partners in `new`."""
     place = jnp.minimum(jnp.searchsorted(old, t), len(old) - 1)
     return jnp.where(jnp.isfinite(t) & (old[place] == t), new[place], t)

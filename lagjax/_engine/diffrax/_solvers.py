@@ -19,7 +19,7 @@ import numpy as np
 PyTree = Any
 
 
-class _Around(diffrax.AbstractAdaptiveSolver):
+class _SolverWrapper(diffrax.AbstractAdaptiveSolver):
     """The parts that a wrapper leaves to the `solver` inside it: all but the step, its terms and its dense output."""
 
     solver: eqx.AbstractVar[diffrax.AbstractSolver]
@@ -58,7 +58,7 @@ def _hermite_slope(place, rise, first, last):
     return 6 * place * (1 - place) * rise + (1 - place) * (1 - 3 * place) * first + place * (3 * place - 2) * last
 
 
-class _Polynomial(diffrax.AbstractLocalInterpolation):
+class _CorrectedHermite(diffrax.AbstractLocalInterpolation):
     """Hermite's cubic through both ends of a step plus θ²(1−θ)² C(θ), which does not change the ends.
 
     It is not written as a sum of powers of θ, which would lose three digits to cancellation.
@@ -87,7 +87,7 @@ class _Polynomial(diffrax.AbstractLocalInterpolation):
         return jax.tree.map(value, self.y0, self.y1, self.first, self.last, self.correction)
 
 
-class FineOutput(_Around):
+class FineOutput(_SolverWrapper):
     r"""The steps of an explicit Runge–Kutta solver of diffrax, with better states between them.
 
     The solver's own interpolant gives states at four points inside the step, the equations give the slopes there, and
@@ -117,7 +117,7 @@ class FineOutput(_Around):
 
     solver: diffrax.AbstractERK
 
-    interpolation_cls: ClassVar[Callable] = _Polynomial
+    interpolation_cls: ClassVar[Callable] = _CorrectedHermite
 
     def __check_init__(self):
         explicit = isinstance(self.solver, diffrax.AbstractERK)
@@ -152,7 +152,7 @@ class FineOutput(_Around):
         return y1, error, coefficients, state, result
 
 
-class Projected(_Around):
+class Projected(_SolverWrapper):
     """The steps of a solver, each followed by a projection of the state (2n,): `project(t, y, args)`, a Newton step.
 
     Two Newton steps are taken, the second of which says whether the method converges. Where it does not, the state is
@@ -181,7 +181,7 @@ class Projected(_Around):
             return y, y
 
         _, (near, nearer) = jax.lax.scan(take_newton_step, y1, length=2)
-        failed = ~_contracts(y1, near, nearer)
+        failed = ~_newton_contracts(y1, near, nearer)
         if error is not None:
             error = jnp.abs(error) + jnp.abs(near - y1)
         arrays, others = eqx.partition((nearer, error, dense), eqx.is_inexact_array)
@@ -192,7 +192,7 @@ class Projected(_Around):
         return y1, error, dense, state, diffrax.RESULTS.where(result == diffrax.RESULTS.successful, projection, result)
 
 
-def _contracts(start: jax.Array, near: jax.Array, nearer: jax.Array) -> jax.Array:
+def _newton_contracts(start: jax.Array, near: jax.Array, nearer: jax.Array) -> jax.Array:
     """True if Newton's method converges: its second step is a hundredth of its first, or rounding.
 
     Near a solution the method squares the distance; from too far away a step covers half of it at best, which a

@@ -41,7 +41,7 @@ def run_by_handler(flow: Flow, tolerances: Tolerances, host: Callable, shapes, t
     `host(ts, y0, params, *begun)` continues what the handler leaves undone (`_native.Begun`); its results, of these
     `shapes`, are those of the whole.
     """
-    _register()
+    _register_target()
     members, states = y0.shape
     kernel = flow.kernel.select_width(members)
     plan = kernel.plan(tolerances.rtol, tolerances.atol, tolerances.max_steps)
@@ -71,7 +71,7 @@ def derivative_by_handler(kind: str, flow: Flow, tolerances: Tolerances, rows: t
     `rows` are the arguments of its handler (`_native.derivative_handler`). Then come `excess` (N,); whether it is done,
     () of bool; and what must live as long as the compiled program.
     """
-    _register()
+    _register_target()
     ts, y0, *_, start = rows
     (members, states), times = y0.shape, ts.shape[1]
     directions = start.shape[1] if kind == "jvp" else 1
@@ -84,7 +84,7 @@ def derivative_by_handler(kind: str, flow: Flow, tolerances: Tolerances, rows: t
 
 
 @_native.make_once
-def _register() -> None:
+def _register_target() -> None:
     addresses = {_TARGET: _native.handler().address}
     addresses |= {f"lagjax_{kind}": _native.derivative_handler(kind) for kind in ("jvp", "vjp")}
     for target, address in addresses.items():

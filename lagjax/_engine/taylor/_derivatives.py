@@ -61,7 +61,7 @@ def jvp(flow: Flow, motions: Motions, dy0, dparams, tolerances: Tolerances) -> t
     members, m = dy0.shape[:2]
     if flow.projection is not None:
         dy0 = project_start_tangents(flow.projection, ts[:, :1], y0, params, dy0, dparams)
-    groups = _groups_of_directions(members, m)
+    groups = _direction_group_count(members, m)
     directions = math.ceil(m / groups)
     padding = ((0, 0), (0, groups * directions - m), (0, 0))
     padded = (np.pad(x, padding).reshape(members * groups, directions, -1) for x in (dy0, dparams))
@@ -92,7 +92,7 @@ def start_outputs(ts, dy0, path_dot, library: Any = np):
     return library.where((ts == ts[:, :1])[:, None, :, None], dy0[:, :, None], path_dot)
 
 
-def _groups_of_directions(members: int, m: int) -> int:
+def _direction_group_count(members: int, m: int) -> int:
     """Into how many rows the m directions of each member go: those of a few members on all threads."""
     lanes = _native.lanes()
     return max(1, min(_native.cores() // members, math.ceil(m / lanes))) if members < lanes else 1
@@ -110,7 +110,7 @@ def _jvp_over_steps(flow: Flow, motions: Motions, dots, tolerances) -> tuple[np.
         path_dot[rows], y_dot[rows], excess = steps.kernel.jvp(*given, tolerances.floor)
         return excess / tolerances.largest_excess
 
-    for row in _go_over_steps(flow, motions, tolerances, advance_tangents, advance_tangents):
+    for row in _differentiate_steps(flow, motions, tolerances, advance_tangents, advance_tangents):
         path_dot[row], y_dot[row] = np.nan, np.nan
         if (m := dy0.shape[1]) > 1:  # steps may suit some of these directions
             alone = [x[row, :, None] for x in dots]
@@ -198,7 +198,7 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
         _, end, excess = steps.kernel.jvp(*given, tolerances.floor)
         return np.where(np.isfinite(end).all(axis=-1).any(axis=-1), excess / tolerances.largest_excess, np.nan)
 
-    if lost := list(_go_over_steps(flow, motions, tolerances, transpose_steps, probe)):
+    if lost := list(_differentiate_steps(flow, motions, tolerances, transpose_steps, probe)):
         of = motions.take(np.array(lost))
         inner = path_ct[lost] * (of.ts != of.ts[:, :1])[..., None]
         inner[:, -1] = 0.0
@@ -260,7 +260,7 @@ def _projection_line(differentiate: Callable, program: Program, t: int) -> Line:
 # ---- the steps that a derivative goes over ---------------------------------------------------------------------------
 
 
-def _go_over_steps(
+def _differentiate_steps(
     flow: Flow, motions: Motions, tolerances: Tolerances, go: Callable, probe: Callable
 ) -> Iterator[int]:
     """Let `go(steps)` take a derivative over the steps of all rows; rows that no steps suit are given.
@@ -268,8 +268,8 @@ def _go_over_steps(
     `go` and `probe` return how large the last terms of the series are, (R,), in units of the limit. `go` may bound that
     from above; where `probe` is larger than 1, the steps are divided until they suit.
     """
-    for steps in _steps_of(flow, motions, tolerances):
-        limit = _limit_of(steps)
+    for steps in _record_steps(flow, motions, tolerances):
+        limit = _last_term_limit(steps)
         excess = go(steps)
         long = np.flatnonzero(excess > limit)
         if not long.size:
@@ -287,12 +287,12 @@ def _go_over_steps(
                 go(better)
 
 
-def _limit_of(steps: Steps) -> float:
+def _last_term_limit(steps: Steps) -> float:
     """The largest last terms in units of the limit: beside where a root has no series, those that follow are larger."""
     return 1 / EXCESS if has_passages(steps.kernel) else 1.0
 
 
-def _steps_of(flow: Flow, motions: Motions, tolerances: Tolerances) -> Iterator[Steps]:
+def _record_steps(flow: Flow, motions: Motions, tolerances: Tolerances) -> Iterator[Steps]:
     """The steps of all rows, which are run once more, a portion after the other.
 
     To keep those of the first run would save a twentieth of the time in most cases, and a fifth at most.
@@ -323,7 +323,7 @@ def _suitable_steps(flow: Flow, steps: Steps, params, tolerances, excess, measur
             return None
         divided = _divide_steps(flow, divided, params, tolerances)
         found.append((float((excess := measure(divided))[0]), len(found), divided))
-        if excess <= _limit_of(steps):
+        if excess <= _last_term_limit(steps):
             return divided
         if flow.projection is not None and float(excess[0]) > 0.5 * before:
             measure(steps)
@@ -335,7 +335,7 @@ def _suitable_steps(flow: Flow, steps: Steps, params, tolerances, excess, measur
 def _divide_steps(flow: Flow, steps: Steps, params, tolerances: Tolerances) -> Steps:
     """The steps of one member, those that are too long in parts; others stay as they are."""
     ((_, rows),) = steps.split_members()
-    excess = rows[:, 3] / (_limit_of(steps) * tolerances.largest_excess)
+    excess = rows[:, 3] / (_last_term_limit(steps) * tolerances.largest_excess)
     long = np.where(excess > 1.0, excess, 0.0) ** (1 / (steps.order - 1))
     cuts = [np.arange(n) / n for n in np.ceil(np.clip(1.1 * long, 1, MOST_PARTS)).astype(int)]
     return cut_steps(flow, steps, cuts, params, tolerances)

@@ -110,7 +110,7 @@ class Flow:
         self.groups, self.turns = tuple(range(size)) if groups is None else groups, turns
         self.nesting = nesting or _native.Nesting(size)
         self.general = functools.cache(general)
-        self.tangent = functools.lru_cache(maxsize=8)(self._tangent)
+        self.tangent = functools.lru_cache(maxsize=8)(self._tangent_flow)
 
     @classmethod
     def from_program(cls, program: Program, size: int, projection=None, guards=None, turns=False) -> "Flow":
@@ -198,7 +198,7 @@ class Flow:
             counts, order = done.steps[rows], order or _native.order_for(rtol)
             found.append(Steps(done.table, np.cumsum(counts) - counts, counts, order, self.kernel, rows))
         if not (result == SUCCESSFUL).all():
-            again, flow, tolerances = self._second_chance(solution, ts, params, tolerances)
+            again, flow, tolerances = self._members_to_repeat(solution, ts, params, tolerances)
             if again.any():
                 some_ts, some_y0, some_params = members(again, ts, y0, params)
                 better, steps_again = flow.follow(some_ts, some_y0, some_params, tolerances, room)
@@ -228,7 +228,7 @@ class Flow:
         """q̈ (N, n) at N states."""
         return self.general_program.evaluate_many([*y.T, t, *params.T])[: self.size].T
 
-    def _second_chance(self, solution, ts, params, tolerances: Tolerances) -> "tuple[np.ndarray, Flow, Tolerances]":
+    def _members_to_repeat(self, solution, ts, params, tolerances: Tolerances) -> "tuple[np.ndarray, Flow, Tolerances]":
         """The members to run once more, by which flow and with which tolerances.
 
         A program that assumes a regular mass matrix gives way to one that does not, which is long where a recursion in
@@ -252,7 +252,7 @@ class Flow:
             stuck |= result == _SHRANK
         return stuck & (tolerances.tries > 1), self, tolerances.tighter
 
-    def _tangent(self, directions: int) -> "Flow":
+    def _tangent_flow(self, directions: int) -> "Flow":
         """The flow of q and of its derivatives along this many directions, whose δparams are numbers of it.
 
         It has (1 + D) n coordinates and (1 + D) P parameters. A tangent that is zero by symmetry is as exact as the

@@ -31,12 +31,12 @@ def run_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params) -> tuple:
     except Unlowerable as reason:
         raise ValueError(f"solver=lagjax.MachineCode() cannot integrate this scene on a GPU: {reason}.") from None
     members, path = len(y0), jnp.full((len(y0), *flow.path_shape(ts.shape[1], notes)), jnp.nan)
-    arrays = _inputs(gpu.MOTION, ts, y0, params, flow, tolerances, room_of_notes=notes) | {"path": path}
+    arrays = _launch_inputs(gpu.MOTION, ts, y0, params, flow, tolerances, room_of_notes=notes) | {"path": path}
     guards = flow.kernel.ending_guards
     shapes = [path.shape, y0.shape, *[(members,)] * 4, (members, max(1, guards))]  # an array that has an address
     *results, changes = launch(gpu.MOTION, program, members, arrays, shapes)
     results.append(changes[:, :guards])
-    return _solution(*results, states=not notes)
+    return _launch_solution(*results, states=not notes)
 
 
 def transpose_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params, path_ct, end_ct) -> tuple:
@@ -50,14 +50,14 @@ def transpose_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params, path_ct
     program, row = flow.kernel.gpu_programs.transpose(tolerances.rtol)
     members, threads = len(y0), math.prod(gpu.grid(gpu.TRANSPOSE, len(y0)))
     room = min(tolerances.max_steps, gpu.LARGEST_RECORD // (threads * row))
-    arrays = _inputs(gpu.TRANSPOSE, ts, y0, params, flow, tolerances, room=room)
+    arrays = _launch_inputs(gpu.TRANSPOSE, ts, y0, params, flow, tolerances, room=room)
     arrays |= {"path_ct": path_ct, "end_ct": end_ct}
     shapes = [y0.shape, (members, max(1, flow.numbers)), (members,), (members,), (threads * room * row,)]
     y_ct, params_ct, excess, done, _ = launch(gpu.TRANSPOSE, program, members, arrays, shapes)
     return y_ct, params_ct[:, : flow.numbers], excess, done > 0
 
 
-def _inputs(entry: gpu.Entry, ts, y0, params, flow: Flow, tolerances: Tolerances, **more: int) -> dict[str, Any]:
+def _launch_inputs(entry: gpu.Entry, ts, y0, params, flow: Flow, tolerances: Tolerances, **more: int) -> dict[str, Any]:
     rtol, atol, max_steps, *_ = tolerances
     numbers = entry.words(
         members=len(y0), times=ts.shape[1], ts_stride=ts.shape[1] if len(ts) > 1 else 0,
@@ -81,7 +81,7 @@ def launch(entry: gpu.Entry, program: str, members: int, arrays: dict[str, Any],
     return list(call(*given, name="integrate", kernel_type="ptx", kernel_data=program, **attributes))[1:]
 
 
-def _solution(path, y_end, t_end, code, steps, rejected, changes, states: bool) -> tuple:
+def _launch_solution(path, y_end, t_end, code, steps, rejected, changes, states: bool) -> tuple:
     """The results of the kernel as the fields of a `Solution`; NaN in the path where a member did not come."""
     code, steps, rejected, changes = (x.astype(int) for x in (code, steps, rejected, changes))
     result = jnp.asarray(RESULT_OF_CODE)[code]

@@ -71,11 +71,11 @@ def join_columns(*parts):
 
 def line_of(program: Program, count: int | None = None) -> "Line":
     """The first `count` outputs of a program, by default all; other inputs than floats are given as floats."""
-    return _line_of(program, count)
+    return _simplified_line(program, count)
 
 
 @functools.lru_cache(maxsize=64)
-def _line_of(program: Program, count: int | None) -> "Line":
+def _simplified_line(program: Program, count: int | None) -> "Line":
     line, dtypes = program.line.replace(outputs=program.line.outputs[:count]), program.dtypes
     root, linear = None, program.linear
     if any(dtype.kind != "f" for dtype in dtypes):
@@ -364,17 +364,17 @@ def _register_handler() -> None:
     jax.ffi.register_ffi_target(_TARGET, capsule(line_handler()), platform="cpu", api_version=1)
 
 
-def _push(x, w, _, line: Line):
+def _push_tangents(x, w, _, line: Line):
     return forward_p.bind(*x, *w, line=line)
 
 
-def _pull(x, w, _, line: Line):
+def _pull_cotangents(x, w, _, line: Line):
     return back_p.bind(*x, *w, line=line)
 
 
 value_p = _LineMap("value", lambda line: line, lambda line: [line.outputs, *filter(None, [line.memo])])
-forward_p = _LineMap("forward", lambda line: line.forward, lambda line: [line.outputs], 1, _pull)
-back_p = _LineMap("back", lambda line: line.back, lambda line: [line.width], 1, _push)
+forward_p = _LineMap("forward", lambda line: line.forward, lambda line: [line.outputs], 1, _pull_cotangents)
+back_p = _LineMap("back", lambda line: line.back, lambda line: [line.width], 1, _push_tangents)
 
 
 # ---- operations of functions on the host -----------------------------------------------------------------------------

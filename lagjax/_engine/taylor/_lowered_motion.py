@@ -33,7 +33,7 @@ def lowered_motion(derivation: Derivation) -> Motion:
     return _LoweredMotion(*functions, constraints, derivation=derivation)
 
 
-def _lowered(as_written: Callable) -> Callable:
+def _use_programs(as_written: Callable) -> Callable:
     """A decorator: the method is that of the scene `as_written` where its programs may not be differentiated."""
 
     def decorate(method: Callable) -> Callable:
@@ -46,69 +46,69 @@ def _lowered(as_written: Callable) -> Callable:
     return decorate
 
 
-def _quantity(as_written: Callable) -> Callable:
-    @_lowered(as_written)
+def _program_quantity(as_written: Callable) -> Callable:
+    @_use_programs(as_written)
     def evaluate(self, *state):
-        return _evaluate(self.derivation, *state, as_written.__name__)[0]
+        return _evaluate_quantities(self.derivation, *state, as_written.__name__)[0]
 
     return evaluate
 
 
 class _LoweredConstraints(Constraints):
     derivation: Derivation = eqx.field(static=True, kw_only=True)
-    residual, rates = map(_quantity, (Constraints.residual, Constraints.rates))
-    jacobian, gamma = map(_quantity, (Constraints.jacobian, Constraints.gamma))
+    residual, rates = map(_program_quantity, (Constraints.residual, Constraints.rates))
+    jacobian, gamma = map(_program_quantity, (Constraints.jacobian, Constraints.gamma))
 
-    @_lowered(Constraints.f)
+    @_use_programs(Constraints.f)
     def f(self, q, t, params):
         return self.residual(q, jnp.zeros_like(q), t, params)[: self.derivation.position_count]
 
 
 class _LoweredMotion(Motion):
     derivation: Derivation = eqx.field(static=True, kw_only=True)
-    momentum, mass_matrix = map(_quantity, (Motion.momentum, Motion.mass_matrix))
-    generalized_force = _quantity(Motion.generalized_force)
+    momentum, mass_matrix = map(_program_quantity, (Motion.momentum, Motion.mass_matrix))
+    generalized_force = _program_quantity(Motion.generalized_force)
 
-    @_lowered(Motion.mass_matrix_and_force)
+    @_use_programs(Motion.mass_matrix_and_force)
     def mass_matrix_and_force(self, q, qdot, t, params):
         """M and F of M q̈ = F + Gᵀλ."""
-        return tuple(_evaluate(self.derivation, q, qdot, t, params, "mass_matrix", "force"))
+        return tuple(_evaluate_quantities(self.derivation, q, qdot, t, params, "mass_matrix", "force"))
 
-    @_lowered(Motion.energy)
+    @_use_programs(Motion.energy)
     def energy(self, q, qdot, t, params):
-        momentum, value = _evaluate(self.derivation, q, qdot, t, params, "momentum", "lagrangian")
+        momentum, value = _evaluate_quantities(self.derivation, q, qdot, t, params, "momentum", "lagrangian")
         return momentum @ qdot - value
 
     def unbalanced_force(self, q, qdot, qddot, t, params):
         """M q̈ − F, by a program of its own."""
         if self.derivation.differentiates_force:
-            return _outputs(self.derivation.unbalanced_force, q, qdot, t, params, qddot)
+            return _program_outputs(self.derivation.unbalanced_force, q, qdot, t, params, qddot)
         return super().unbalanced_force(q, qdot, qddot, t, params)
 
     def required_force(self, q, qdot, t, params, qddot, terms=0.0):
         """τ at an acceleration, and which constraints that violates beyond rounding."""
         state, of = (q, qdot, t, params), self.derivation
         if self.constrained and of.differentiates:
-            terms = jax.lax.stop_gradient(_outputs(of.term_program(("gamma",)), *state))
+            terms = jax.lax.stop_gradient(_program_outputs(of.term_program(("gamma",)), *state))
         return super().required_force(*state, qddot, terms)
 
-    @_lowered(Motion.solved_acceleration)
+    @_use_programs(Motion.solved_acceleration)
     def solved_acceleration(self, q, qdot, t, params):
         """q̈, NaN where its matrix is singular, and whether that is so."""
         try:
             program = self.derivation.accelerations.program.complete
         except Unlowerable:
             return super().solved_acceleration(q, qdot, t, params)
-        *acceleration, singular = _outputs(program, q, qdot, t, params)
+        *acceleration, singular = _program_outputs(program, q, qdot, t, params)
         return jnp.where(singular > 0, jnp.nan, jnp.stack(acceleration)), singular > 0
 
 
-def _evaluate(derivation: Derivation, q, qdot, t, params, *names: str) -> list[Array]:
-    values = _outputs(derivation.program(*names), q, qdot, t, params)
+def _evaluate_quantities(derivation: Derivation, q, qdot, t, params, *names: str) -> list[Array]:
+    values = _program_outputs(derivation.program(*names), q, qdot, t, params)
     return list(derivation.split_outputs(names, values).values())
 
 
-def _outputs(program: Program, q, qdot, t, params, *more) -> Array:
+def _program_outputs(program: Program, q, qdot, t, params, *more) -> Array:
     """The outputs of a program of (q, q̇, t, numbers) and more vectors, (outputs,)."""
     numbers = jnp.concatenate([jnp.zeros(0, q.dtype), *(jnp.ravel(x).astype(q.dtype) for x in jax.tree.leaves(params))])
     return line_of(program)(q, qdot, jnp.reshape(t, 1).astype(q.dtype), numbers, *more)

@@ -28,7 +28,7 @@ def part_passages(flow: Flow, steps: Steps, params, end, tolerances: Tolerances)
     states = np.concatenate([rows[:, 4 : 4 + flow.states], end[None]])
     t, h = np.append(rows[:, 0], rows[-1, 0] + rows[-1, 1]), rows[:, 1]
     pieces = rows[:, 4 + flow.states : -3] if rows.shape[1] > 4 + flow.states else rows[:, :0]
-    u = _arguments(steps, states, t, params, pieces[[*range(len(rows)), -1]])
+    u = _singular_arguments(steps, states, t, params, pieces[[*range(len(rows)), -1]])
     k, step = np.nonzero(u[:, :-1] * u[:, 1:] < 0)
     if not len(k):
         return steps
@@ -37,8 +37,8 @@ def part_passages(flow: Flow, steps: Steps, params, end, tolerances: Tolerances)
     times = t[step] + at * h[step]
     order = np.argsort(times * h[0])
     there = np.empty((len(k), flow.states))
-    there[order] = _states_at(flow, times[order], t, states[0], params, tolerances)
-    now = _arguments(steps, there, times, params, pieces[step])[k, np.arange(len(k))]
+    there[order] = _states_at_times(flow, times[order], t, states[0], params, tolerances)
+    now = _singular_arguments(steps, there, times, params, pieces[step])[k, np.arange(len(k))]
     is_before = now * u0 > 0
     at = np.where(is_before, at + (1 - at) * now / (now - u1), at * u0 / (u0 - now))
     parts = GROWTH ** -np.arange(-np.log(NEAREST) / np.log(GROWTH))
@@ -50,7 +50,7 @@ def part_passages(flow: Flow, steps: Steps, params, end, tolerances: Tolerances)
     return cut_steps(flow, steps, [np.unique(cut) for cut in cuts], params, tolerances)
 
 
-def _arguments(steps: Steps, states, t, params, pieces) -> np.ndarray:
+def _singular_arguments(steps: Steps, states, t, params, pieces) -> np.ndarray:
     """The numbers (K, S) that are zero where a root has no series, at S states of a member."""
     borders, chosen = steps.kernel.borders, steps.kernel.chosen
     assert borders is not None
@@ -68,13 +68,13 @@ def cut_steps(flow: Flow, steps: Steps, cuts: list[np.ndarray], params, toleranc
     end = rows[-1, 0] + rows[-1, 1]
     table[:, 1], inner = np.diff(np.append(table[:, 0], end)), part > 0
     first, t = rows[0, 4 : 4 + flow.states], [rows[0, 0], end]
-    table[inner, 4 : 4 + flow.states] = _states_at(flow, table[inner, 0], t, first, params, tolerances)
+    table[inner, 4 : 4 + flow.states] = _states_at_times(flow, table[inner, 0], t, first, params, tolerances)
     if rows.shape[1] > 4 + flow.states:  # which border it ends at, and whether that is grazed
         table[np.append(of[1:] == of[:-1], False), -3:] = 0.0
     return steps._replace(table=table, first=np.zeros(1, int), counts=np.array([len(table)]))
 
 
-def _states_at(flow: Flow, times, t, first, params, tolerances: Tolerances) -> np.ndarray:
+def _states_at_times(flow: Flow, times, t, first, params, tolerances: Tolerances) -> np.ndarray:
     """The states of a motion at times between, from its `first` state; `t` begins and ends with its own times."""
     ts = np.concatenate([t[:1], times, t[-1:]])
     return flow.follow(ts[None], first[None], params[None], tolerances)[0].path[0, 1:-1]

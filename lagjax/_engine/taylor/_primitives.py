@@ -66,8 +66,8 @@ def run(flow: Flow, tolerances: Tolerances, ts, y0, params) -> Solution:
     A flow with guards has no derivatives: they would have to say how its end moves.
     """
     if default_platform() == "cpu":  # outside of `jit` the host computes, and nothing is compiled for a new scene
-        return _run(ts, y0, params, flow=flow, tolerances=tolerances)
-    return compile_once(_run, flow=flow, tolerances=tolerances)(ts, y0, params)
+        return _bind_run(ts, y0, params, flow=flow, tolerances=tolerances)
+    return compile_once(_bind_run, flow=flow, tolerances=tolerances)(ts, y0, params)
 
 
 @functools.lru_cache(maxsize=64)
@@ -87,9 +87,9 @@ _RUN, _MOTIONS = (1, 1, 1), (1, 1, 1, 2, 0, 0, 0)
 _GIVEN = len(_MOTIONS)
 
 
-def _rows(arrays, inner, library: Any = np):
+def _member_rows(arrays, inner, library: Any = np):
     """Each array with one row a member, `ts` and `params` with one where that is all there is; and the batch axes."""
-    batch = _batch_of(arrays, inner)
+    batch = _split_batch(arrays, inner)
 
     def rows(place, x, k):
         own = x.shape[x.ndim - k :]
@@ -100,7 +100,7 @@ def _rows(arrays, inner, library: Any = np):
     return [rows(place, x, k) for place, (x, k) in enumerate(zip(arrays, inner, strict=True))], batch
 
 
-def _batch_of(arrays, inner):
+def _split_batch(arrays, inner):
     return np.broadcast_shapes(*(x.shape[: x.ndim - k] for x, k in zip(arrays, inner, strict=True)))
 
 
@@ -109,13 +109,13 @@ def _restore_batch(results, batch):
 
 
 def _run_on_host(ts, y0, params, *, flow, tolerances):
-    rows, batch = _rows((ts, y0, params), _RUN)
+    rows, batch = _member_rows((ts, y0, params), _RUN)
     return _restore_batch(flow.run(*rows, tolerances)[:_OUTPUTS], batch)
 
 
 def _derive_on_host(name, inner, *args, flow, tolerances, **_):
     """`_derivatives.jvp` or `vjp`, whose last arguments have these `inner` axes."""
-    rows, batch = _rows(args, (*_MOTIONS, *inner))
+    rows, batch = _member_rows(args, (*_MOTIONS, *inner))
     derive = getattr(_derivatives, name)
     return _restore_batch(derive(flow, Motions(*rows[:_GIVEN]), *rows[_GIVEN:], tolerances), batch)
 
@@ -129,45 +129,45 @@ _vjp_on_host = functools.partial(_derive_on_host, "vjp", (3, 2))
 _OUTPUTS = len(Solution._fields) - 1  # of run: a `Solution` but for the last field, which is that of a batch
 
 
-def _run(ts, y0, params, **settings) -> Solution:
+def _bind_run(ts, y0, params, **settings) -> Solution:
     return Solution(*run_p.bind(ts, y0, params, **settings))
 
 
-def _floats(*shapes):
+def _float_shapes(*shapes):
     return [ShapedArray(shape, np.dtype(float)) for shape in shapes]
 
 
 def _run_shapes(ts, y0, params, *, flow, tolerances, **_):
-    batch = _batch_of((ts, y0, params), _RUN)
+    batch = _split_batch((ts, y0, params), _RUN)
     shapes = *[batch] * 3, (*batch, flow.kernel.ending_guards)
     counts = [ShapedArray(shape, np.dtype(int)) for shape in shapes]
-    floats = _floats((*batch, *flow.path_shape(ts.shape[-1], tolerances.notes)), (*batch, flow.states), batch)
+    floats = _float_shapes((*batch, *flow.path_shape(ts.shape[-1], tolerances.notes)), (*batch, flow.states), batch)
     return [*floats, *counts]
 
 
 def _jvp_shapes(*args, flow, **_):
-    batch, m = _batch_of((*args[:3], *args[_GIVEN:]), (*_RUN, 2, 2)), args[_GIVEN].shape[-2]
-    return _floats((*batch, m, args[0].shape[-1], flow.states), (*batch, m, flow.states))
+    batch, m = _split_batch((*args[:3], *args[_GIVEN:]), (*_RUN, 2, 2)), args[_GIVEN].shape[-2]
+    return _float_shapes((*batch, m, args[0].shape[-1], flow.states), (*batch, m, flow.states))
 
 
 def _vjp_shapes(*args, flow, **_):
-    batch, m = _batch_of(args, (*_MOTIONS, 3, 2)), args[-1].shape[-2]
-    return _floats((*batch, m, flow.states), (*batch, m, flow.numbers))
+    batch, m = _split_batch(args, (*_MOTIONS, 3, 2)), args[-1].shape[-2]
+    return _float_shapes((*batch, m, flow.states), (*batch, m, flow.numbers))
 
 
 def _curvature_shapes(*args, flow, **_):
-    batch = _batch_of(args, (*_RUN, 2, 1, 1, 1))
-    return _floats((*batch, flow.states), (*batch, flow.numbers))
+    batch = _split_batch(args, (*_RUN, 2, 1, 1, 1))
+    return _float_shapes((*batch, flow.states), (*batch, flow.numbers))
 
 
 def _curvature_composed(ts, y0, params, path_ct, end_ct, dy0, dparams, *, flow, tolerances):
     """`curvature` by going back over the steps of the tangent flow, with cotangents of the tangent alone."""
     larger, tolerances = flow.tangent(1), tolerances.with_larger_budget
     given, length = _tangent_inputs(flow, ts, y0, params, dy0, dparams)
-    solution = _run(*given, flow=larger, tolerances=tolerances)
+    solution = _bind_run(*given, flow=larger, tolerances=tolerances)
     path_ct, end_ct = (from_rows(jnp.stack([jnp.zeros_like(ct), ct], axis=-2)) for ct in (path_ct, end_ct))
     cts = path_ct[..., None, :, :], end_ct[..., None, :]
-    state_ct, numbers_ct = vjp_p.bind(*_motions(*given, solution), *cts, flow=larger, tolerances=tolerances)
+    state_ct, numbers_ct = vjp_p.bind(*_constant_motions(*given, solution), *cts, flow=larger, tolerances=tolerances)
     state_ct, numbers_ct = to_rows(state_ct[..., 0, :], flow.size)[..., 0, :], numbers_ct[..., 0, : flow.numbers]
     return [state_ct * length, numbers_ct * length]
 
@@ -175,7 +175,7 @@ def _curvature_composed(ts, y0, params, path_ct, end_ct, dy0, dparams, *, flow, 
 def _jvp_composed(ts, y0, params, dy0, dparams, *, flow, tolerances):
     """`jvp` along one direction, (…, 2n) and (…, P), by the run of the tangent flow, and the result of that."""
     given, length = _tangent_inputs(flow, ts, y0, params, dy0, dparams)
-    solution = _run(*given, flow=flow.tangent(1), tolerances=tolerances.with_larger_budget)
+    solution = _bind_run(*given, flow=flow.tangent(1), tolerances=tolerances.with_larger_budget)
     path, end = (to_rows(y, flow.size)[..., 1, :] for y in (solution.path, solution.y_end))
     return path * length[..., None], end * length, solution.result
 
@@ -205,12 +205,12 @@ def _project_direction(flow: Flow, t, y0, params, dy0, dparams):
     return jnp.vectorize(differentiate_start, signature="(),(s),(p),(s),(p)->(s)")(t, y0, params, dy0, dparams)
 
 
-def _rate(flow: Flow, *state):
+def _state_rate(flow: Flow, *state):
     """`rate` at a state (t, y, params), compiled as one."""
     return compile_once(rate, flow)(*state)
 
 
-def _motions(ts, y0, params, solution: Solution) -> Motions:
+def _constant_motions(ts, y0, params, solution: Solution) -> Motions:
     """The arguments of `jvp` and `vjp` that are those of a run and its outcome, with which their values do not vary."""
     return Motions.from_solution(ts, y0, params, jax.tree.map(jax.lax.stop_gradient, solution))
 
@@ -224,15 +224,15 @@ def _vary_run(primals, tangents, outs, *, flow, tolerances):
         return [None] * len(outs)
     dy0, dparams = map(ad.instantiate_zeros, (dy0, dparams))
     if not is_zero(dts):
-        dy0 = dy0 - _rate(flow, ts[..., 0], y0, params) * dts[..., :1]
+        dy0 = dy0 - _state_rate(flow, ts[..., 0], y0, params) * dts[..., :1]
     direction = [x[..., None, :] for x in (dy0, dparams)]
-    motions = _motions(ts, y0, params, solution)
+    motions = _constant_motions(ts, y0, params, solution)
     d_path, d_end = jvp_p.bind(*motions, *direction, flow=flow, tolerances=tolerances)
     d_path, d_end, d_t_end = d_path[..., 0, :, :], d_end[..., 0, :], jnp.zeros_like(solution.t_end)
     if not is_zero(dts):
         reached, done = jnp.isfinite(solution.path), solution.result == SUCCESSFUL
         places = jnp.where(reached, solution.path, y0[..., None, :])
-        rates = _rate(flow, ts, places, params[..., None, :]) * dts[..., None]
+        rates = _state_rate(flow, ts, places, params[..., None, :]) * dts[..., None]
         d_path = d_path + jnp.where(reached, rates, 0.0)
         d_end = d_end + jnp.where(done[..., None], rates[..., -1, :], 0.0)
         d_t_end = jnp.where(done, dts[..., -1], 0.0)
@@ -257,7 +257,7 @@ def _vary_vjp(primals, tangents, outs, **settings):
     total = None
     if not is_zero(dts):
         total = _vjp_variation_in_time(primals, dts, outs, settings)
-        dy0 = dy0 - _rate(settings["flow"], ts[..., 0], y0, params) * dts[..., :1]
+        dy0 = dy0 - _state_rate(settings["flow"], ts[..., 0], y0, params) * dts[..., :1]
     given = [x[..., None, :] for x in (ts, y0, params)]
     direction = [x[..., None, :] for x in (dy0, dparams)]
     more = curvature_p.bind(*given, *cts, *direction, **settings)
@@ -277,10 +277,10 @@ def _vjp_variation_in_time(primals, dts, outs, settings):
     weights = weights.at[..., -1, :].add(jnp.where(done[..., None, None], end_ct, 0.0))
 
     def rates(places, numbers):
-        return _rate(flow, ts[..., None, :], places, numbers[..., None, :]) * dts[..., None, :, None]
+        return _state_rate(flow, ts[..., None, :], places, numbers[..., None, :]) * dts[..., None, :, None]
 
     def first_rate(y, numbers):
-        return -_rate(flow, ts[..., None, 0], y, numbers) * dts[..., None, :1]
+        return -_state_rate(flow, ts[..., None, 0], y, numbers) * dts[..., None, :1]
 
     def transpose_rate(function, place, cotangent, numbers_shape):
         place = jnp.broadcast_to(place, cotangent.shape)
@@ -388,7 +388,7 @@ def _run_compiled(ts, y0, params, *, flow, tolerances):
     """`run` of what XLA compiles: by the handler where that may be, else on the host."""
     settings = dict(flow=flow, tolerances=tolerances)
     shapes = _run_shapes(ts, y0, params, **settings)
-    rows, batch = _rows((ts, y0, params), _RUN, library=jnp)
+    rows, batch = _member_rows((ts, y0, params), _RUN, library=jnp)
     with jax.enable_x64(True):  # where the kernel is made, and whatever was set where this is lowered
         if not begins_in_handler(flow, math.prod(batch)):
             return call_host(functools.partial(_run_on_host, **settings), shapes, ts, y0, params)
@@ -408,7 +408,7 @@ def _compile_derivative(run_handler, run_on_host, shapes_of, inner, args, settin
     their last terms (`Kernel.jvp`), whether they are done, and what they need to live.
     """
     shapes, function = shapes_of(*args, **settings), functools.partial(run_on_host, **settings)
-    (ts, y0, params, _, _, *counts, a, b), batch = _rows(args, (*_MOTIONS, *inner), library=jnp)
+    (ts, y0, params, _, _, *counts, a, b), batch = _member_rows(args, (*_MOTIONS, *inner), library=jnp)
     flow, members = settings["flow"], copies * math.prod(batch)
 
     def call_handler(*args):
@@ -460,7 +460,7 @@ def _vjp_compiled(*args, **settings):
 
 
 def _run_for_gpus(ts, y0, params, *, flow, tolerances, **_):
-    rows, batch = _rows((ts, y0, params), _RUN, library=jnp)
+    rows, batch = _member_rows((ts, y0, params), _RUN, library=jnp)
     with jax.enable_x64(True):  # whatever was set where this is lowered
         return _restore_batch(run_on_gpu(flow, tolerances, *rows), batch)
 
@@ -477,7 +477,7 @@ def _vjp_for_gpus(*args, flow, tolerances):
     """Cotangents of starts and params, back over the steps; by tangents under constraints, or without a record."""
     settings = dict(flow=flow, tolerances=tolerances)
     with jax.enable_x64(True):
-        rows, batch = _rows(args, (*_MOTIONS, 3, 2), library=jnp)
+        rows, batch = _member_rows(args, (*_MOTIONS, 3, 2), library=jnp)
         motions, (path_ct, end_ct) = Motions(*rows[:_GIVEN]), rows[_GIVEN:]
         ts, (members, m) = motions.ts, end_ct.shape[:2]
         few = m <= flow.states + flow.numbers and flow.projection is None
@@ -518,7 +518,7 @@ def _go_back_on_gpu(motions: Motions, path_ct, end_ct, *, flow, tolerances):
 def _vjp_by_tangents(ts, y0, params, *given, flow, tolerances):
     """`vjp`: the derivative along every number of the start and the parameters, times the cotangents."""
     *run, path_ct, end_ct = given
-    batch = _batch_of((ts, y0, params), _RUN)
+    batch = _split_batch((ts, y0, params), _RUN)
     basis = jnp.broadcast_to(jnp.eye(count := flow.states + flow.numbers), (*batch, count, count))
     along = basis[..., : flow.states], basis[..., flow.states :]
     path, end = _jvp_for_gpus(ts, y0, params, *run, *along, flow=flow, tolerances=tolerances)

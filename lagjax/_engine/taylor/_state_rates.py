@@ -25,7 +25,7 @@ def rate(flow: Flow, t, y, params):
     if borders is not None and any(guard.slide >= 0 for guard in borders.guards):
         chosen = params if flow.kernel.chosen is None else params[..., jnp.array(flow.kernel.chosen.positions, int)]
         rows = rows._replace(first=join_columns(rows.first, chosen))
-        found = _evaluate_pieces(borders, rows, _pieces(borders, rows, n))[0][:n]
+        found = _evaluate_pieces(borders, rows, _pieces_at_state(borders, rows, n))[0][:n]
         acceleration = jnp.stack(jnp.broadcast_arrays(*found), axis=-1)
     else:
         acceleration = outputs(program, n, rows.first, params)
@@ -41,7 +41,7 @@ def _evaluate_pieces(borders, rows: Rows, pieces) -> tuple[tuple, tuple]:
     return values[:count], values[count:]
 
 
-def _pieces(borders, rows: Rows, n: int) -> list[Any]:
+def _pieces_at_state(borders, rows: Rows, n: int) -> list[Any]:
     """The pieces at a state; 1 for those that say that the motion slides."""
     count, zero = len(borders.switches), jnp.zeros_like(rows.first[..., 0])
     pieces = list(emit_rows(borders.decide, rows._replace(pieces=[zero] * (2 * count))))
@@ -53,7 +53,7 @@ def _pieces(borders, rows: Rows, n: int) -> list[Any]:
         j, piece = guard.piece, pieces[guard.piece]
         beyond, ends = guard.beyond(piece), (zero - 1, zero + 1)
         below, above = ends if guard.beyond.slope < 0 else (jnp.minimum(piece, beyond), jnp.maximum(piece, beyond))
-        found = jnp.abs(switches[j] - _level(borders, guard, rows, piece)), below, above
+        found = jnp.abs(switches[j] - _border_level(borders, guard, rows, piece)), below, above
         known = sides.get(guard.slide, (j, *found))[1:]
         sides[guard.slide] = (j, *(jnp.where(found[0] < known[0], x, y) for x, y in zip(found, known, strict=True)))
 
@@ -77,7 +77,7 @@ def _pieces(borders, rows: Rows, n: int) -> list[Any]:
     return [lax.stop_gradient(piece) for piece in pieces]
 
 
-def _level(borders, guard, rows: Rows, piece):
+def _border_level(borders, guard, rows: Rows, piece):
     if guard.of_table:
         index = guard.level.slope * piece + guard.level.offset
         table = borders.decisions[guard.piece].table.table

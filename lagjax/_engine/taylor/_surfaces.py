@@ -86,13 +86,13 @@ class Surfaces(NamedTuple):
             return SINGLE_NOISE * sum(jax.tree.leaves(moved))
 
         rounding = lower(sizes_by_rounding, y, numbers, moving=moving) if is_rounded else None
-        complete = _complete(values, motion, moving, rounding)
+        complete = _guard_rates_and_noise(values, motion, moving, rounding)
         pieces = _borders_of(values, derivation.layout.size)
-        follow = functools.cache(lambda: _followed(values, motion, moving, pieces))
+        follow = functools.cache(lambda: _guards_and_rates(values, motion, moving, pieces))
         return cls(values, complete, follow, directions, is_rounded, pieces)
 
 
-def _complete(values: Program, motion: Program, moving: int, rounding: Program | None) -> Program:
+def _guard_rates_and_noise(values: Program, motion: Program, moving: int, rounding: Program | None) -> Program:
     """g, ġ, the sizes of both, and what rounding of a start does to g, see `Surfaces`."""
 
     def scalars(expansion, arguments):
@@ -102,7 +102,7 @@ def _complete(values: Program, motion: Program, moving: int, rounding: Program |
         one, zero = graph.number(1.0), graph.number(0.0)
         read = sorted(i for i in values.find_inputs(range(len(outputs))) if i < moving) or [0]
         by_y = {j: tangents_in(graph, values.line, nodes, {j: one}, {}) for j in read}
-        rate, found = _rate(motion, expansion, ids, moving), []
+        rate, found = _rate_of_change(motion, expansion, ids, moving), []
         for i in outputs:
             at = [j for j, by in by_y.items() if by.get(i, zero) != zero] or read[:1]  # most are zero, of many watches
             slopes = Scalars(expansion, np.array([by_y[j].get(i, zero) for j in at]))
@@ -114,12 +114,12 @@ def _complete(values: Program, motion: Program, moving: int, rounding: Program |
     return lower_scalars(scalars, values.shapes, forms.OPERATION_BUDGET, moving)
 
 
-def _followed(values: Program, motion: Program, moving: int, pieces: StraightLine | None) -> Program:
+def _guards_and_rates(values: Program, motion: Program, moving: int, pieces: StraightLine | None) -> Program:
     """All g and the distances of their borders, how fast both change along the motion, and (q̇, q̈)."""
 
     def scalars(expansion, arguments):
         graph, ids = expansion.graph, np.concatenate([x.ravel() for x in arguments])
-        rate, found = _rate(motion, expansion, ids, moving).ids.tolist(), []
+        rate, found = _rate_of_change(motion, expansion, ids, moving).ids.tolist(), []
         lines = [values.line] if pieces is None else [values.line, pieces]
         for line in lines:
             nodes = copy_nodes(graph, line, ids.tolist(), [graph.position(i) for i in ids.tolist()])
@@ -132,7 +132,7 @@ def _followed(values: Program, motion: Program, moving: int, pieces: StraightLin
     return lower_scalars(scalars, values.shapes, forms.OPERATION_BUDGET, moving)
 
 
-def _rate(motion: Program, expansion, ids: np.ndarray, moving: int) -> Scalars:
+def _rate_of_change(motion: Program, expansion, ids: np.ndarray, moving: int) -> Scalars:
     """The rate of (q, q̇, t) in a graph where the inputs are `ids`."""
     outputs = motion.place(expansion, ids)[list(motion.line.outputs[: moving // 2])]
     one = expansion.constants(np.ones(1))
@@ -191,7 +191,7 @@ def move_to_zero(surfaces: Surfaces, k, taken, at: tuple, still: tuple) -> tuple
     nothing moves. Where the guard jumps through zero, δg is that of the number whose border is there: the one that is
     nearest in time.
     """
-    follow = functools.partial(_follow, surfaces)
+    follow = functools.partial(_follow_guards, surfaces)
     (t, y, _), (values, rates, slope) = at, follow(*at)
     zeros, still_rates, still_slope = follow(*still)
     along = jnp.ones_like(t), still_slope
@@ -211,11 +211,11 @@ def jumps_through_zero(surfaces: Surfaces, k, t, y, numbers):
     """True if guard k changes its sign at (t, y) by a jump, at a border of its own."""
     if surfaces.borders is None:
         return np.array(False)
-    values, rates, _ = _follow(surfaces, *jax.lax.stop_gradient((t, y, numbers)))
+    values, rates, _ = _follow_guards(surfaces, *jax.lax.stop_gradient((t, y, numbers)))
     return _find_zero(surfaces, k, values, rates) >= len(surfaces.directions)
 
 
-def _follow(surfaces: Surfaces, t, y, numbers) -> list:
+def _follow_guards(surfaces: Surfaces, t, y, numbers) -> list:
     """The guards and the distances of their borders, how fast both change, and the rate of the state."""
     program, n = surfaces.followed(), y.shape[0] // 2
     found = outputs(program, len(program.line.outputs), jnp.append(y, t), numbers)
