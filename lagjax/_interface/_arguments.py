@@ -66,7 +66,7 @@ class Function(eqx.Module):
         except (AttributeError, IndexError, TypeError) as reason:
             if isinstance(reason, _NO_VALUES):
                 what = _NO_COUNT if isinstance(reason, jax.errors.TracerIntegerConversionError) else _USE_JAX
-                where, text = _expression(reason)
+                where, text = _failing_expression(reason)
                 at = f", {where}, `{text}`" if text else where and f", {where}"
                 raise ValueNotKnown(f"{self.name}{at}: {what}") from None
             asks = "params" in self.extras
@@ -77,10 +77,10 @@ class Function(eqx.Module):
                 ) from reason
             if asks and (expression := find_params_expression(reason)):
                 given = jax.tree.structure(extras["params"])
-                _note(reason, self.name, f"it reads `{expression}`, and the params that it is given are {given}.")
+                _add_note(reason, self.name, f"it reads `{expression}`, and the params that it is given are {given}.")
             raise
         except KeyError as reason:
-            _note(reason, self.name, _keys_of(roles, extras))
+            _add_note(reason, self.name, _dict_keys(roles, extras))
             raise
 
 
@@ -113,7 +113,7 @@ _OF_A_SCENE = "a function of a scene"
 _NOT_USERS = str(Path(__file__).parents[1]), str(Path(jax.__file__).parent)
 
 
-def _keys_of(roles: tuple, extras: dict[str, Any]) -> str:
+def _dict_keys(roles: tuple, extras: dict[str, Any]) -> str:
     first = {"q": roles[0]} if roles else {}
     dicts = {name: value for name, value in (first | extras).items() if isinstance(value, dict)}
     if not dicts:
@@ -124,11 +124,11 @@ def _keys_of(roles: tuple, extras: dict[str, Any]) -> str:
 
 def find_params_expression(reason: Exception) -> str | None:
     """The expression that read `params` where a function of the user failed; None where something else failed."""
-    _, text = _expression(reason)
+    _, text = _failing_expression(reason)
     return text if text.startswith(("params", "(params")) else None
 
 
-def _expression(reason: Exception) -> tuple[str, str]:
+def _failing_expression(reason: Exception) -> tuple[str, str]:
     """The line of the user that failed, and its expression; empty where these are not known."""
     frames = traceback.extract_tb(reason.__traceback__)
     theirs = [frame for frame in frames if not frame.filename.startswith(_NOT_USERS)]
@@ -139,7 +139,7 @@ def _expression(reason: Exception) -> tuple[str, str]:
     return f"line {last.lineno} of {Path(last.filename).name}", text.strip()
 
 
-def _note(error: Exception, name: str, text: str) -> None:
+def _add_note(error: Exception, name: str, text: str) -> None:
     """Say beneath an error of Python or JAX which function of the scene it came from, and what that means."""
     if not any(_OF_A_SCENE in note for note in getattr(error, "__notes__", ())):
         error.add_note(f"This is {name}, {_OF_A_SCENE}: {text}")
@@ -164,7 +164,7 @@ def accept(
     except ValueError:
         raise TypeError(f"The signature of {role} cannot be read; wrap it in a plain function {expected}.") from None
 
-    parameters = [_readable(p) for p in signature.parameters.values()]
+    parameters = [_parameter_text(p) for p in signature.parameters.values()]
     leading, rest = parameters[: len(roles)], parameters[len(roles) :]
     positional = [p for p in leading if p.kind in _BY_POSITION and p.name not in extras]
     if len(positional) < len(roles):
@@ -202,7 +202,7 @@ def _resembles_extra(name: str, extras: tuple[str, ...]) -> bool:
     return bool(difflib.get_close_matches(name.lower(), known, cutoff=0.7))
 
 
-def _readable(parameter: inspect.Parameter) -> inspect.Parameter:
+def _parameter_text(parameter: inspect.Parameter) -> inspect.Parameter:
     """A parameter as a sentence shows it: without a default that would fill the screen."""
     short = len(str(parameter)) <= _SHOWN
     return parameter if short else parameter.replace(default=parameter.empty, annotation=parameter.empty)

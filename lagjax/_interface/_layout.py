@@ -37,8 +37,8 @@ class Layout:
 
         The rates of q that are given in the place of q̇ have another `name`.
         """
-        paths, tree, shapes, dtypes = _structure(q, "q")
-        _, qdot_tree, qdot_shapes, qdot_dtypes = _structure(qdot, name)
+        paths, tree, shapes, dtypes = _checked_structure(q, "q")
+        _, qdot_tree, qdot_shapes, qdot_dtypes = _checked_structure(qdot, name)
         if tree != qdot_tree:
             raise ValueError(f"q and {name} must have the same structure; got {tree} for q and {qdot_tree} for {name}.")
         rate = "velocity" if name == "qdot" else "acceleration"
@@ -56,7 +56,7 @@ class Layout:
     @classmethod
     def from_numbers(cls, tree: PyTree, name: str, dtype) -> "Layout":
         """The layout of any pytree of real floats; `TypeError`, with the `name` of the leaf, for anything else."""
-        paths, structure, shapes, _ = _structure(tree, name)
+        paths, structure, shapes, _ = _checked_structure(tree, name)
         return cls(structure, shapes, paths, np.dtype(dtype))
 
     @property
@@ -103,7 +103,7 @@ def flatten_numbers(numbers: PyTree, dtype) -> Float[Array, " P"]:
     return jnp.concatenate(leaves) if leaves else jnp.zeros(0, dtype)
 
 
-def _structure(tree: PyTree, name: str) -> tuple[tuple[str, ...], Any, tuple[tuple[int, ...], ...], list]:
+def _checked_structure(tree: PyTree, name: str) -> tuple[tuple[str, ...], Any, tuple[tuple[int, ...], ...], list]:
     """The paths, the tree, the shapes and the dtypes of a pytree, whose leaves are checked to hold real floats."""
     paths, leaves, structure = labelled_leaves(tree, name)
     dtypes = []

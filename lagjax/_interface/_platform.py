@@ -33,7 +33,7 @@ def has_nvidia_gpu() -> bool:
 
 
 @functools.cache
-def _as_written() -> dict[str, Any]:
+def _unoptimised_options() -> dict[str, Any]:
     """The options of XLA without optimisation, as far as this version of it has them."""
     # Compilation of the algebra around a few matrices takes half of the time so, and runs as fast to a millisecond.
     options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
@@ -52,7 +52,7 @@ def compile_for_one_call(function: Callable) -> Callable:
 
     @functools.cache
     def as_written() -> Callable:
-        return eqx.filter_jit(function, compiler_options=_as_written())  # pyright: ignore[reportCallIssue]
+        return eqx.filter_jit(function, compiler_options=_unoptimised_options())  # pyright: ignore[reportCallIssue]
 
     @functools.wraps(function)
     def call(*arguments):

@@ -23,7 +23,7 @@ PUSHED = (
 )
 
 
-class _InWords(type(eqx.Enumeration)):
+class _WordedEnum(type(eqx.Enumeration)):
     def __getitem__(cls, item) -> str:
         """The sentence of one result, or its name where it has none; of many, how many there are by name."""
         code = item._value
@@ -36,7 +36,7 @@ class _InWords(type(eqx.Enumeration)):
         )
 
 
-class RESULTS(eqx.Enumeration, metaclass=_InWords):  # pyright: ignore[reportGeneralTypeIssues]
+class RESULTS(eqx.Enumeration, metaclass=_WordedEnum):  # pyright: ignore[reportGeneralTypeIssues]
     """The result codes of diffrax, extended; compare with `trajectory.result == lagjax.RESULTS.successful`."""
 
     __module__ = "lagjax"  # as it is printed

@@ -25,13 +25,13 @@ def as_arrays(tree: PyTree, dtype, name: str = "params") -> PyTree:
         leaves, structure = jax.tree.flatten(tree)  # the names of leaves cost more than all else
     except ValueError:
         _, leaves, structure = labelled_leaves(tree, name)  # which raises a sentence
-    if not all(_is_plain(leaf, dtype) for leaf in leaves):
+    if not all(_is_valid_leaf(leaf, dtype) for leaf in leaves):
         labels, leaves, structure = labelled_leaves(tree, name)
         return structure.unflatten(_leaf_as_array(*of, dtype) for of in zip(leaves, labels, strict=True))
     return structure.unflatten([np.asarray(leaf, dtype) if type(leaf) is float else leaf for leaf in leaves])
 
 
-def _is_plain(leaf, dtype) -> bool:
+def _is_valid_leaf(leaf, dtype) -> bool:
     """True if nothing can be wrong with a leaf: a Python float, or an array that has the dtype of the state."""
     if type(leaf) is float:
         return dtype != _SINGLE or _TINY <= abs(leaf) <= _HUGE or leaf == 0
@@ -51,14 +51,14 @@ def _leaf_as_array(leaf, label: str, dtype):
     if np.ma.is_masked(leaf):
         raise ValueError(f"{label} is masked in places, where it has no number: fill them first.")
     if dtype == _SINGLE and label.startswith("params"):
-        _require_single(leaf, label)
+        _require_float32_range(leaf, label)
     try:
         return _as_array(leaf, dtype if jnp.issubdtype(jnp.result_type(leaf), jnp.floating) else None)
     except OverflowError:
         raise ValueError(f"{label} is too large for an integer of 64 bits: write it as a float.") from None
 
 
-def _require_single(leaf, label: str) -> None:
+def _require_float32_range(leaf, label: str) -> None:
     """Raise `ValueError` where float32 is too narrow for the largest number of a leaf."""
     largest = float(np.max(np.abs(np.asarray(leaf, float)), initial=0.0)) if is_concrete(leaf) else 0.0
     if largest and np.isfinite(largest) and not _TINY <= largest <= _HUGE and getattr(leaf, "dtype", None) != _SINGLE:
@@ -152,14 +152,14 @@ def require_finite(tree: PyTree, name: str) -> None:
 def require_number(value, name: str) -> None:
     kind = _dtype_of(value) if eqx.is_array_like(value) else None
     if kind is None or kind == jnp.bool_ or jnp.issubdtype(kind, jnp.complexfloating):
-        raise TypeError(f"{name} must be a real number; got {value!r}.{_say_params(value)}")
+        raise TypeError(f"{name} must be a real number; got {value!r}.{_suggest_params(value)}")
     if isinstance(value, int) and abs(value) >= 2**63:
         raise ValueError(f"{name} is too large for an integer of 64 bits: write it as a float.")
     if jnp.ndim(value) != 0:
         raise ValueError(f"{name} must be one number; got shape {jnp.shape(value)}.")
 
 
-def _say_params(value) -> str:
+def _suggest_params(value) -> str:
     """A sentence about parameters that stand in the place of a number or of times; nothing for anything else."""
     if not isinstance(value, dict | list | tuple | eqx.Module):
         return ""
@@ -171,7 +171,7 @@ def output_times(ts, dtype, rows: bool = False) -> jax.Array | np.ndarray:
 
     Raises for what is not strictly monotonic, or not two times.
     """
-    known = isinstance(ts, np.ndarray | jax.Array) and _is_plain(ts, dtype) and is_concrete(ts)
+    known = isinstance(ts, np.ndarray | jax.Array) and _is_valid_leaf(ts, dtype) and is_concrete(ts)
     if known and (ts.ndim == 1 or (rows and ts.ndim == 2)):
         values = np.asarray(ts)  # most often there is nothing to say
         if values.shape[-1] > 1 and len(values) and _is_monotonic(values) and all_finite(values):
@@ -184,7 +184,7 @@ def output_times(ts, dtype, rows: bool = False) -> jax.Array | np.ndarray:
     try:
         kind = dtype_of(ts if isinstance(ts, jax.Array) else np.asarray(ts))
     except (TypeError, ValueError):
-        got = f"{type(ts).__name__}.{_say_params(ts)}"
+        got = f"{type(ts).__name__}.{_suggest_params(ts)}"
         raise TypeError(f"ts must be an array of output times; got {got}") from None
     if np.ndim(ts) == 2 and not rows:
         raise ValueError(
@@ -196,7 +196,7 @@ def output_times(ts, dtype, rows: bool = False) -> jax.Array | np.ndarray:
     if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
         raise TypeError(f"ts must hold real numbers; got {kind}.")
     whole = ts if isinstance(ts, jax.Array) else np.asanyarray(ts)
-    times = whole if _is_plain(whole, dtype) else _as_array(_leaf_as_array(whole, "ts", dtype), dtype)
+    times = whole if _is_valid_leaf(whole, dtype) else _as_array(_leaf_as_array(whole, "ts", dtype), dtype)
     require_finite(times, "ts")
     if is_concrete(times):
         values = np.asarray(times)

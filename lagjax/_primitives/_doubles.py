@@ -57,7 +57,7 @@ def compute_in_doubles(function: Callable, *arguments: PyTree) -> PyTree:
             results = call_with_arrays(*map(_widen, arrays))
             results = [_narrow_array(x, is_on) for x in results]
     else:
-        results = computed_p.bind(*map(jnp.asarray, arrays), of=_Map(call_with_arrays), keeps_integers=is_on)
+        results = computed_p.bind(*map(jnp.asarray, arrays), of=_DoublesMap(call_with_arrays), keeps_integers=is_on)
     found = iter(results)
     return made["tree"].unflatten([next(found) if other is None else other for other in made["others"]])
 
@@ -120,11 +120,11 @@ def _widen(array) -> np.ndarray:
 
 def _narrow_array(array, keeps_integers: bool):
     """The array as float32, by NumPy, which compiles nothing; what NumPy holds stays there."""
-    narrow = np.asarray(array).astype(_narrow(array.dtype, keeps_integers), copy=False)
+    narrow = np.asarray(array).astype(_narrow_tree(array.dtype, keeps_integers), copy=False)
     return narrow if not isinstance(array, jax.Array) else jax.device_put(narrow)
 
 
-def _narrow(dtype, keeps_integers: bool) -> np.dtype:
+def _narrow_tree(dtype, keeps_integers: bool) -> np.dtype:
     dtype = np.dtype(dtype)
     if dtype.kind in "iu" and not keeps_integers:
         return np.dtype(f"{dtype.kind}{min(dtype.itemsize, 4)}")
@@ -135,7 +135,7 @@ def _narrow(dtype, keeps_integers: bool) -> np.dtype:
 
 
 @dataclass(frozen=True, eq=False)
-class _Map:
+class _DoublesMap:
     """A function of arrays (*x, *v) that returns a list of arrays, and is linear in the last `linear` arguments, v.
 
     `transposed(*x, *w)` gives the cotangents of v from those of the results. `results` are the shapes and types of
@@ -147,7 +147,7 @@ class _Map:
     transposed: Callable | None = None
     results: tuple[ShapedArray, ...] | None = None
 
-    def derivative(self, size: int, moving: tuple[int, ...], results: dict[int, ShapedArray]) -> "_Map":
+    def derivative(self, size: int, moving: tuple[int, ...], results: dict[int, ShapedArray]) -> "_DoublesMap":
         """(*its `size` arguments, *tangents of those that are `moving`) ↦ the tangents of these `results`."""
 
         def restrict_to_moving(arguments, others):
@@ -165,9 +165,9 @@ class _Map:
             function, at, cotangents = restrict_to_moving(given[:size], given[size:])
             return list(jax.vjp(function, *at)[1](list(cotangents)))
 
-        return _Map(forward, len(moving), back, tuple(results.values()))
+        return _DoublesMap(forward, len(moving), back, tuple(results.values()))
 
-    def batched(self, axes: tuple, size: int) -> "_Map":
+    def batched(self, axes: tuple, size: int) -> "_DoublesMap":
         """The map for batches of this size along these axes of its arguments, and along the first of its results."""
         first, back = len(axes) - self.linear, self.transposed
 
@@ -176,28 +176,28 @@ class _Map:
             return jax.vmap(back, in_axes=(*axes[:first], *[0] * (len(given) - first)))(*given)
 
         results = self.results and tuple(ShapedArray((size, *x.shape), x.dtype) for x in self.results)
-        return _Map(jax.vmap(self.function, in_axes=axes), self.linear, transposed, results)
+        return _DoublesMap(jax.vmap(self.function, in_axes=axes), self.linear, transposed, results)
 
 
-def _shapes(*arrays, of: _Map, keeps_integers: bool):
+def _result_shapes(*arrays, of: _DoublesMap, keeps_integers: bool):
     if of.results is not None:
         return list(of.results)
     with jax.enable_x64(True):
         wide = [jax.ShapeDtypeStruct(x.shape, _WIDE.get(x.dtype, x.dtype)) for x in arrays]
         results = jax.eval_shape(of.function, *wide)
-    return [ShapedArray(x.shape, _narrow(x.dtype, keeps_integers)) for x in results]
+    return [ShapedArray(x.shape, _narrow_tree(x.dtype, keeps_integers)) for x in results]
 
 
-def _lower(ctx, *arrays, of: _Map, keeps_integers: bool):
+def _lower_to_doubles(ctx, *arrays, of: _DoublesMap, keeps_integers: bool):
     def rounded(*arrays):
         results = of.function(*(x.astype(_WIDE.get(x.dtype, x.dtype)) for x in arrays))
-        return [jnp.asarray(x).astype(_narrow(x.dtype, keeps_integers)) for x in results]
+        return [jnp.asarray(x).astype(_narrow_tree(x.dtype, keeps_integers)) for x in results]
 
     with jax.enable_x64(True):
         return mlir.lower_fun(rounded, multiple_results=True)(ctx, *arrays)
 
 
-def _vary(primals, tangents, results, *, of: _Map, **settings):
+def _map_jvp(primals, tangents, results, *, of: _DoublesMap, **settings):
     floats = {i: _shape_of(x) for i, x in enumerate(results) if jnp.issubdtype(x.dtype, jnp.inexact)}
     moving = tuple(i for i, x in enumerate(tangents) if not is_zero(x))
     derivative = of.derivative(len(primals), moving, floats)
@@ -211,13 +211,13 @@ def _shape_of(x) -> ShapedArray:
     return ShapedArray(aval.shape, aval.dtype)
 
 
-def _transpose(known, cotangents, moving, *, of: _Map, **settings):
+def _transpose_map(known, cotangents, moving, *, of: _DoublesMap, **settings):
     assert of.transposed is not None
-    transposed = _Map(of.transposed, len(cotangents), of.function, tuple(map(_shape_of, moving)))
+    transposed = _DoublesMap(of.transposed, len(cotangents), of.function, tuple(map(_shape_of, moving)))
     return computed_p.bind(*known, *cotangents, of=transposed, **settings)
 
 
-def _batch(arrays, axes, *, of: _Map, **settings):
+def _batch_map(arrays, axes, *, of: _DoublesMap, **settings):
     first = len(arrays) - of.linear
     size = next(x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None)
     # What it is linear in has one row a member, so that a cotangent of it has, too.
@@ -230,10 +230,10 @@ def _batch(arrays, axes, *, of: _Map, **settings):
     return results, [0] * len(results)
 
 
-computed_p = LinearMap("lagjax_in_doubles", _shapes, _vary, lambda *, of, **_: of.linear, _transpose)
+computed_p = LinearMap("lagjax_in_doubles", _result_shapes, _map_jvp, lambda *, of, **_: of.linear, _transpose_map)
 compute_on_host(
     computed_p,
     lambda *arrays, of, keeps_integers: [_narrow_array(x, keeps_integers) for x in of.function(*map(_widen, arrays))],
 )
-mlir.register_lowering(computed_p, _lower)
-batching.primitive_batchers[computed_p] = _batch
+mlir.register_lowering(computed_p, _lower_to_doubles)
+batching.primitive_batchers[computed_p] = _batch_map

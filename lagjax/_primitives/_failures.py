@@ -74,7 +74,7 @@ def sentence(result, t_end, t_last, y_end, names: tuple[str, ...], why: str | No
     )
 
 
-def _check(result, t_end, t_last, y_end, *, names):
+def _raise_failure(result, t_end, t_last, y_end, *, names):
     if text := sentence(result, t_end, t_last, y_end, names):
         raise SimulationError(text, None)
     return [np.zeros(result.shape, t_end.dtype)]
@@ -85,15 +85,15 @@ def _check_shapes(result, t_end, *_, **__):
 
 
 check_p = LinearMap("lagjax_check", _check_shapes, vary=lambda *_, **__: [None])
-compute_on_host(check_p, _check)
+compute_on_host(check_p, _raise_failure)
 
 
-def _lower_with(call: Callable):
+def _lower_check(call: Callable):
     """One comparison where all is well; the host is called, by `call(host, shape, *arrays)`, where something failed."""
 
     def check(result, t_end, *others, names):
         def host(*arrays):
-            _check(*map(np.asarray, arrays), names=names)
+            _raise_failure(*map(np.asarray, arrays), names=names)
 
         shape = jax.ShapeDtypeStruct(result.shape, t_end.dtype)
         well = jnp.isin(result, jnp.asarray(ENDED_WELL, result.dtype)).all()
@@ -114,7 +114,7 @@ NOT_EXPORTED = (
 )
 
 
-def _lower_here(rule: Callable, what: str, in_exports: bool = False):
+def _lower_callback(rule: Callable, what: str, in_exports: bool = False):
     """The rule of what may not be exported, as calls back to this process."""
 
     def lower_checked(context, *args, **settings):
@@ -126,15 +126,15 @@ def _lower_here(rule: Callable, what: str, in_exports: bool = False):
 
 
 _RAISES = "an error that is raised at run time, as with throw=True,"
-mlir.register_lowering(check_p, _lower_here(_lower_with(jax.pure_callback), _RAISES))
-mlir.register_lowering(check_p, _lower_here(_lower_with(_call_on_buffers), _RAISES), platform="cpu")
+mlir.register_lowering(check_p, _lower_callback(_lower_check(jax.pure_callback), _RAISES))
+mlir.register_lowering(check_p, _lower_callback(_lower_check(_call_on_buffers), _RAISES), platform="cpu")
 
 # The steps of diffrax have checks of equinox, which call back to the host as well, but for EQX_ON_ERROR=nan.
 steps_p = LinearMap("lagjax_steps", lambda ended: [ended], vary=lambda *_, **__: [None])
 compute_on_host(steps_p, lambda ended: [ended])
 _silent = EQX_ON_ERROR in ("nan", "off")
 _same = mlir.lower_fun(lambda ended: [ended], multiple_results=True)
-mlir.register_lowering(steps_p, _lower_here(_same, "the checks of diffrax's steps", _silent))
+mlir.register_lowering(steps_p, _lower_callback(_same, "the checks of diffrax's steps", _silent))
 
 
 def mark_steps(ended):
@@ -169,15 +169,15 @@ def lost_unless(reached, x, inputs):
 
     Where a derivative is not wanted, it stays zero.
     """
-    return nan_unless_p.bind(jnp.broadcast_to(reached, jnp.shape(x)), x, *_floats(inputs), marks=True, batch=0)
+    return nan_unless_p.bind(jnp.broadcast_to(reached, jnp.shape(x)), x, *_float_arrays(inputs), marks=True, batch=0)
 
 
 def differentiable_where(well, x, *inputs):
     """`x` itself, whose derivatives by it and by `inputs` are NaN unless `well` holds."""
-    return nan_unless_p.bind(jnp.broadcast_to(well, jnp.shape(x)), x, *_floats(inputs), marks=False, batch=0)
+    return nan_unless_p.bind(jnp.broadcast_to(well, jnp.shape(x)), x, *_float_arrays(inputs), marks=False, batch=0)
 
 
-def _floats(tree) -> list:
+def _float_arrays(tree) -> list:
     return [x for x in jax.tree.leaves(tree) if jnp.issubdtype(jnp.result_type(x), jnp.floating)]
 
 

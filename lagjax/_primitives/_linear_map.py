@@ -40,13 +40,13 @@ class VaryingPrimitive(Primitive):
         def add_axes(*args, **settings):
             results = rule(*args, **settings)
             given = next((x for x in args if x.mat.varying), None)
-            return results if given is None else jax.tree.map(functools.partial(_like, given), results)
+            return results if given is None else jax.tree.map(functools.partial(_with_type_variation, given), results)
 
         super().def_abstract_eval(add_axes)
         return rule
 
 
-def _like(given: ShapedArray, result: ShapedArray) -> ShapedArray:
+def _with_type_variation(given: ShapedArray, result: ShapedArray) -> ShapedArray:
     """The type of a result that varies as the type that is given does."""
     everywhere = given.sharding.update(spec=PartitionSpec(*[None] * result.ndim))
     return result.update(sharding=everywhere, manual_axis_type=given.mat)
@@ -180,7 +180,7 @@ def attach_derivative(function: Callable, values: tuple, *arguments) -> tuple:
     return tuple(with_p.bind(*fixed, *map(jnp.asarray, arguments), function=function, count=len(fixed)))
 
 
-def _values(*arrays, function, count):
+def _first_arrays(*arrays, function, count):
     return list(arrays[:count])
 
 
@@ -200,8 +200,8 @@ def _batch_expression(arrays, axes, *, function, count):
 
 
 with_p = LinearMap("lagjax_differentiated_as", lambda *avals, count, **_: list(avals[:count]), vary=_vary_expression)
-with_p.def_impl(_values)
-mlir.register_lowering(with_p, mlir.lower_fun(_values, multiple_results=True))
+with_p.def_impl(_first_arrays)
+mlir.register_lowering(with_p, mlir.lower_fun(_first_arrays, multiple_results=True))
 batching.primitive_batchers[with_p] = _batch_expression
 
 
@@ -216,21 +216,21 @@ def keep_together(y, offsets, limits):
     return together_p.bind(limits, y, offsets)[0]
 
 
-def _together(limits, y, offsets, library: Any = jnp):
+def _mask_far(limits, y, offsets, library: Any = jnp):
     near = library.all(library.abs(offsets) <= limits, axis=-1, keepdims=True)
     return [library.where(near, y, jnp.nan)]
 
 
-def _pull_together(known, cotangents, moving):
+def _pull_mask(known, cotangents, moving):
     (limits,), (cotangent,) = known, cotangents
     lost = jnp.isfinite(limits) & jnp.any(cotangent != 0, axis=-1, keepdims=True)
     return [cotangent, jnp.where(lost, jnp.nan, 0.0)]
 
 
-together_p = LinearMap("lagjax_together", lambda limits, y, _: [y], lambda *_: [None], 2, _pull_together)
-together_p.def_impl(_together)
-together_p.on_host = functools.partial(_together, library=np)
-mlir.register_lowering(together_p, mlir.lower_fun(_together, multiple_results=True))
+together_p = LinearMap("lagjax_together", lambda limits, y, _: [y], lambda *_: [None], 2, _pull_mask)
+together_p.def_impl(_mask_far)
+together_p.on_host = functools.partial(_mask_far, library=np)
+mlir.register_lowering(together_p, mlir.lower_fun(_mask_far, multiple_results=True))
 
 
 # ---- linear systems --------------------------------------------------------------------------------------------------

@@ -41,7 +41,7 @@ class HostFunction:
         self._known: set[int] = set()  # the slots of constants
         self._made: dict[tuple, list[int]] = {}  # the slots of what was computed
         calls: list[tuple] = []
-        self._outputs = self._write(traced, [self._slot() for _ in traced.jaxpr.invars], calls)
+        self._outputs = self._write_calls(traced, [self._slot_of() for _ in traced.jaxpr.invars], calls)
         needed, self._calls = set(self._outputs), []
         for call, given, found in reversed(calls):
             if needed.intersection(found):
@@ -62,22 +62,22 @@ class HostFunction:
                         values[i] = x
         return [values[i] for i in self._outputs]
 
-    def _slot(self, value=None) -> int:
+    def _slot_of(self, value=None) -> int:
         self._values.append(None if value is None else np.asarray(value)[None])
         if value is not None:
             self._known.add(len(self._values) - 1)
         return len(self._values) - 1
 
-    def _write(self, traced, inputs: list[int], calls: list) -> list[int]:
+    def _write_calls(self, traced, inputs: list[int], calls: list) -> list[int]:
         """Add the calls of what was traced; the slots of its results."""
         slots = dict(zip(traced.jaxpr.invars, inputs, strict=True))
-        slots |= {of: self._slot(x) for of, x in zip(traced.jaxpr.constvars, traced.consts, strict=True)}
+        slots |= {of: self._slot_of(x) for of, x in zip(traced.jaxpr.constvars, traced.consts, strict=True)}
 
         def slot(of) -> int:
             if not isinstance(of, core.Literal):
                 return slots[of]
             key = str(of.aval), repr(of.val)
-            return (self._made.get(key) or self._made.setdefault(key, [self._slot(of.val)]))[0]
+            return (self._made.get(key) or self._made.setdefault(key, [self._slot_of(of.val)]))[0]
 
         for equation in traced.jaxpr.eqns:
             primitive, params, given = equation.primitive, equation.params, [slot(x) for x in equation.invars]
@@ -88,19 +88,19 @@ class HostFunction:
             if primitive.name in _SAME:
                 found = given
             elif inner is not None:
-                found = self._write(inner, given, calls)
+                found = self._write_calls(inner, given, calls)
             else:
-                found = self._add(equation, given, calls)
+                found = self._add_operation(equation, given, calls)
             slots.update(zip(equation.outvars, found, strict=True))
         return [slot(x) for x in traced.jaxpr.outvars]
 
-    def _add(self, equation, given: list[int], calls: list) -> list[int]:
+    def _add_operation(self, equation, given: list[int], calls: list) -> list[int]:
         """The slots of the results of an operation: at once of constants, known ones of what was computed before."""
         key = equation.primitive.name, str(equation.params), *given
         if key in self._made:
             return self._made[key]
         known = {k: self._values[i][0] for k, i in enumerate(given) if i in self._known}
-        call, found = _rule(equation, known), [self._slot() for _ in equation.outvars]
+        call, found = _operation_rule(equation, known), [self._slot_of() for _ in equation.outvars]
         if self._known.issuperset(given):
             results = call(*[self._values[i] for i in given])
             for i, x in zip(found, results if isinstance(results, list | tuple) else [results], strict=True):
@@ -111,7 +111,7 @@ class HostFunction:
         return self._made.setdefault(key, found)
 
 
-def _rule(equation, known: dict) -> Callable:
+def _operation_rule(equation, known: dict) -> Callable:
     """The function of arrays, with an axis of members in front, that an operation is; some of them are `known`."""
     name, params = equation.primitive.name, equation.params
     axes, shape = [x.aval.ndim for x in equation.invars], equation.outvars[0].aval.shape
@@ -215,7 +215,7 @@ def _product(dimension_numbers, **_):
     return rule
 
 
-def _each(rule: Callable) -> Callable:
+def _map_members(rule: Callable) -> Callable:
     """A rule of one member for all of them."""
 
     def rule_of_all(*xs):
@@ -225,22 +225,22 @@ def _each(rule: Callable) -> Callable:
     return rule_of_all
 
 
-def _window(shape, sizes, starts) -> tuple[slice, ...]:
+def _window_slices(shape, sizes, starts) -> tuple[slice, ...]:
     begins = [min(max(int(k), 0), whole - size) for k, whole, size in zip(starts, shape, sizes, strict=True)]
     return tuple(slice(begin, begin + size) for begin, size in zip(begins, sizes, strict=True))
 
 
 def _dynamic_slice(slice_sizes, **_):
-    return _each(lambda x, *starts: x[_window(x.shape, slice_sizes, starts)])
+    return _map_members(lambda x, *starts: x[_window_slices(x.shape, slice_sizes, starts)])
 
 
 def _dynamic_update_slice(**_):
     def rule(x, update, *starts):
         out = x.copy()
-        out[_window(x.shape, update.shape, starts)] = update
+        out[_window_slices(x.shape, update.shape, starts)] = update
         return out
 
-    return _each(rule)
+    return _map_members(rule)
 
 
 def _window_places(shape, indices, sizes, of_index, batching, of_batch, mode) -> tuple[tuple, Any]:
@@ -272,7 +272,7 @@ def _gather(dimension_numbers, slice_sizes, mode, **_):
         found = found.squeeze(tuple(count + d for d in lost))
         return np.moveaxis(found, range(count, found.ndim), of.offset_dims)
 
-    return _each(rule)
+    return _map_members(rule)
 
 
 def _scatter_add(dimension_numbers, mode, **_):
@@ -289,7 +289,7 @@ def _scatter_add(dimension_numbers, mode, **_):
         np.add.at(out, places, np.where(inside, updates, 0))
         return out
 
-    return _each(rule)
+    return _map_members(rule)
 
 
 def _scan(jaxpr, length: int, num_consts: int, num_carry: int, reverse: bool, **_):

@@ -63,7 +63,7 @@ class Repetition:
         """The repetition of R′, with x, δx side by side, and so the others."""
 
         def step(x, carry, still, row):
-            (x, dx), (carry, dcarry) = _halves(x), _halves(carry)
+            (x, dx), (carry, dcarry) = _split_halves(x), _split_halves(carry)
             found, moved = jax.jvp(lambda x, carry: self.step(x, carry, still, row), (x, carry), (dx, dcarry))
             return [[*a, *b] for a, b in zip(found, moved, strict=True)]
 
@@ -71,7 +71,7 @@ class Repetition:
         return Repetition(step, *doubled, self.rows, self.fixed)
 
     @functools.lru_cache(maxsize=8)  # noqa: B019  # those of a few
-    def _trace(self, shapes: tuple, goes_back: bool) -> HostFunction:
+    def _trace_round(self, shapes: tuple, goes_back: bool) -> HostFunction:
         """A round, or the cotangents of its x and carry, for arrays of these shapes."""
 
         def pull(x, carry, still, row, cotangents):
@@ -88,7 +88,7 @@ class Repetition:
         shapes = [a.shape[1:] for a in (*x, *first, *still)] + [row.shape[2:] for row in rows]
         for last, written, sums in more:
             shapes += [a.shape[1:] for a in last] + [a.shape[2:] for a in written] + [a.shape[1:] for a in sums]
-        return self._trace(tuple(shapes), goes_back)
+        return self._trace_round(tuple(shapes), goes_back)
 
     # The arrays of NumPy that follow have members in front, or one row that all share.
 
@@ -100,9 +100,9 @@ class Repetition:
         of_round = [c.shape[1:] for c in first] if keeps else self.of_round
         written = [np.zeros((members, length, *shape)) for shape in of_round]
         sums = [np.zeros((members, *shape)) for shape in self.sums]
-        for i, some in _rounds(count, members):
-            before = _take(carry, some)
-            found = go(*_take(x, some), *before, *_take(still, some), *_take(rows, some, i))
+        for i, some in _round_members(count, members):
+            before = _pick(carry, some)
+            found = go(*_pick(x, some), *before, *_pick(still, some), *_pick(rows, some, i))
             behind, new, parts = self.split_results(found)
             for arrays, values in ((written, before if keeps else new), (carry, behind)):
                 for kept, a in zip(arrays, values, strict=True):
@@ -119,9 +119,9 @@ class Repetition:
         members = max(map(len, (*x, *first, *still, *rows, count, *cotangents)))
         x_ct = [np.zeros((members, *a.shape[1:])) for a in x]
         carry_ct = [np.repeat(ct, members // len(ct), axis=0) for ct in last]
-        for i, some in reversed(_rounds(count, members)):
-            given = *_take(x, some), *_take(before, some, i), *_take(still, some), *_take(rows, some, i)
-            found = go(*given, *_take(carry_ct, some), *_take(written, some, i), *_take(sums, some))
+        for i, some in reversed(_round_members(count, members)):
+            given = *_pick(x, some), *_pick(before, some, i), *_pick(still, some), *_pick(rows, some, i)
+            found = go(*given, *_pick(carry_ct, some), *_pick(written, some, i), *_pick(sums, some))
             more, behind = _split(found, self.inputs)
             for total, a in zip(x_ct, more, strict=True):
                 total[some] += a
@@ -130,21 +130,21 @@ class Repetition:
         return [*x_ct, *carry_ct]
 
 
-def _rounds(count, members: int) -> list[tuple]:
+def _round_members(count, members: int) -> list[tuple]:
     """The rounds, and which members have each: a slice where all have."""
     count = np.broadcast_to(count, members)
     of_all = range(int(count.max(initial=0)))
     return [(i, slice(None) if (i < count).all() else np.flatnonzero(i < count)) for i in of_all]
 
 
-def _take(arrays, some, i=slice(None)) -> list:
+def _pick(arrays, some, i=slice(None)) -> list:
     """Of some members, unless all share the one row, what belongs to round i."""
     return [x[some, i] if len(x) > 1 else x[:, i] for x in arrays] if isinstance(i, int) else [
         x[some] if len(x) > 1 else x for x in arrays
     ]  # fmt: skip
 
 
-def _halves(arrays) -> list[list]:
+def _split_halves(arrays) -> list[list]:
     return _split(arrays, len(arrays) // 2)
 
 
@@ -157,24 +157,24 @@ def _split(arrays, *sizes: int) -> list[list]:
 # ---- primitives: (*x, *first carry, *still, *rows, count, *what follows) ---------------------------------------------
 
 
-def _parts(given, of: Repetition) -> list:
+def _split_arguments(given, of: Repetition) -> list:
     """x, the first carry, what is still, the rows, the count, and what follows."""
     x, first, still, rows, (count, *along) = _split(given, of.inputs, of.carried, of.fixed, of.rows)
     return [x, first, still, rows, count, along]
 
 
-def _run(*given, function, of: Repetition, axes: tuple, **_):
+def _run_members(*given, function, of: Repetition, axes: tuple, **_):
     """`function` of all members, in front of which some arrays have these axes."""
     batch, shapes = _drop_batch(given, axes)
     rows = [
-        _as_rows(np.asarray(x), batch, [of_level[j] for of_level in reversed(axes)], shape)
+        _member_rows(np.asarray(x), batch, [of_level[j] for of_level in reversed(axes)], shape)
         for j, (x, shape) in enumerate(zip(given, shapes, strict=True))
     ]
-    found, members = function(of, *_parts(rows, of)), math.prod(batch)
+    found, members = function(of, *_split_arguments(rows, of)), math.prod(batch)
     return [np.broadcast_to(x, (members, *x.shape[1:])).reshape((*batch, *x.shape[1:])) for x in found]
 
 
-def _as_rows(x, batch: tuple, places: list, shape: tuple):
+def _member_rows(x, batch: tuple, places: list, shape: tuple):
     """An array with one row a member; with one for all where it has no axis of these."""
     if all(place is None for place in places):
         return x[None]
@@ -182,20 +182,20 @@ def _as_rows(x, batch: tuple, places: list, shape: tuple):
     return np.broadcast_to(x.reshape((*wide, *shape)), (*batch, *shape)).reshape((math.prod(batch), *shape))
 
 
-def _value(of, x, first, still, rows, count, _):
+def _evaluate_value(of, x, first, still, rows, count, _):
     return of.run(x, first, still, rows, count)
 
 
-def _forward(of, x, first, still, rows, count, along):
+def _evaluate_forward(of, x, first, still, rows, count, along):
     dx, dfirst = _split(along, of.inputs)
     return _later_halves(of.tangent.run([*x, *dx], [*first, *dfirst], still, rows, count), of.tangent)
 
 
-def _back(of, x, first, still, rows, count, cotangents):
+def _evaluate_back(of, x, first, still, rows, count, cotangents):
     return of.go_back(x, first, still, rows, count, cotangents)
 
 
-def _turn(of, x, first, still, rows, count, along):
+def _evaluate_turn(of, x, first, still, rows, count, along):
     cts, dx, dfirst, dcts = _split(along, of.results, of.inputs, of.carried)
     doubled = _interleave(of, dcts, cts)
     found = of.tangent.go_back([*x, *dx], [*first, *dfirst], still, rows, count, doubled)
@@ -210,18 +210,18 @@ def _interleave(of: Repetition, first, second) -> list:
 
 def _first_halves(found, of: Repetition) -> list:
     x, first = _split(found, 2 * of.inputs)
-    return [*_halves(x)[0], *_halves(first)[0]]
+    return [*_split_halves(x)[0], *_split_halves(first)[0]]
 
 
 def _later_halves(found, of: Repetition) -> list:
-    return [a for part in of.split_results(found) for a in _halves(part)[1]]
+    return [a for part in of.split_results(found) for a in _split_halves(part)[1]]
 
 
 def _vary_value(primals, tangents, _, *, of: Repetition, axes: tuple):
     varies = tuple(not is_zero(t) for t in tangents[: of.inputs])
 
     def sort(given):
-        x, first, still, rows, count, _ = _parts(given, of)
+        x, first, still, rows, count, _ = _split_arguments(given, of)
         others = itertools.compress(x, (not here for here in varies))
         return [*itertools.compress(x, varies), *first, *others, *still, *rows, count]
 
@@ -237,8 +237,8 @@ def _vary_forward(primals, tangents, *, of: Repetition, axes: tuple, linear: int
     """J(x) v along (dx, dv): what belongs to v in the derivative of R′ at (x, v), along these."""
 
     def double(given, moved):
-        x, first, still, rows, count, v = _parts(given, of)
-        dx, dfirst, _, _, _, dv = _parts(moved, of)
+        x, first, still, rows, count, v = _split_arguments(given, of)
+        dx, dfirst, _, _, _, dv = _split_arguments(moved, of)
         (vx, vfirst), (dvx, dvfirst) = _split(v, of.inputs), _split(dv, of.inputs)
         return [*x, *vx, *first, *vfirst, *still, *rows, count, *dx, *dvx, *dfirst, *dvfirst]
 
@@ -249,7 +249,7 @@ def _vary_forward(primals, tangents, *, of: Repetition, axes: tuple, linear: int
 
 def _vary_back(primals, tangents, *, of: Repetition, axes: tuple, linear: int):
     def extend(given, moved):
-        dx, dfirst, _, _, _, dcts = _parts(moved, of)
+        dx, dfirst, _, _, _, dcts = _split_arguments(moved, of)
         return [*given, *dx, *dfirst, *dcts]
 
     axes = tuple(tuple(extend(of_level, of_level)) for of_level in axes)
@@ -261,10 +261,10 @@ def _vary_turn(primals, tangents, *, of: Repetition, axes: tuple, linear: int):
     """It along all at once: what belongs to x in `turn` of R′ at (x, dx) and (dw, w), along what these vary."""
 
     def double(given, moved):
-        x, first, still, rows, count, along = _parts(given, of)
-        parts = [_split(some, of.results, of.inputs, of.carried) for some in (along, _parts(moved, of)[-1])]
+        x, first, still, rows, count, along = _split_arguments(given, of)
+        parts = [_split(some, of.results, of.inputs, of.carried) for some in (along, _split_arguments(moved, of)[-1])]
         (cts, dx, dfirst, dcts), (ects, edx, edfirst, edcts) = parts
-        ex, efirst, *_ = _parts(moved, of)
+        ex, efirst, *_ = _split_arguments(moved, of)
         at = [*x, *dx, *first, *dfirst, *still, *rows, count, *_interleave(of, dcts, cts)]
         return [*at, *ex, *edx, *efirst, *edfirst, *_interleave(of, edcts, ects)]
 
@@ -290,7 +290,7 @@ class _RepeatedMap(LinearMap):
             batch, given = _drop_batch(given, settings["axes"])
             return [ShapedArray((*batch, *shape), np.dtype(float)) for shape in shapes(given, settings["of"])]
 
-        linear, run = (lambda linear, **_: linear) if pull else 0, functools.partial(_run, function=function)
+        linear, run = (lambda linear, **_: linear) if pull else 0, functools.partial(_run_members, function=function)
         super().__init__(f"lagjax_repetition_{name}", shape, vary, linear, transpose if pull else None)
         self.vary = vary
         compute_on_host(self, run)
@@ -323,7 +323,7 @@ def _drop_batch(given, axes: tuple) -> tuple[tuple[int, ...], list[tuple[int, ..
 
 
 def _shapes(given, of: Repetition) -> list:
-    _, first, _, rows, *_ = _parts(given, of)
+    _, first, _, rows, *_ = _split_arguments(given, of)
     return [*first, *((rows[0][0], *shape) for shape in of.of_round), *of.sums]
 
 
@@ -351,7 +351,7 @@ def _pull_turn(given, of: Repetition, axes):
     return [*of_x, *_pull_back([*known, *moved], of, narrow)]
 
 
-value_p = _RepeatedMap("value", _shapes, _value, _vary_value)
-forward_p = _RepeatedMap("forward", _shapes, _forward, _vary_forward, _pull_forward)
-back_p = _RepeatedMap("back", _back_shapes, _back, _vary_back, _pull_back)
-turn_p = _RepeatedMap("turn", _back_shapes, _turn, _vary_turn, _pull_turn)
+value_p = _RepeatedMap("value", _shapes, _evaluate_value, _vary_value)
+forward_p = _RepeatedMap("forward", _shapes, _evaluate_forward, _vary_forward, _pull_forward)
+back_p = _RepeatedMap("back", _back_shapes, _evaluate_back, _vary_back, _pull_back)
+turn_p = _RepeatedMap("turn", _back_shapes, _evaluate_turn, _vary_turn, _pull_turn)

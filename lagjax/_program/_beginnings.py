@@ -77,9 +77,9 @@ def decide_pieces(decided: DecidedProgram, slides: Sequence[Slide]) -> StraightL
         if not slide.parts:  # a border that the motion has left does not hold it
             begins = f("and", begins, f("not", stays[j]))
         if slide.order > 1:
-            begins = f("and", begins, f("eq", _rate(decided, graph, nodes, j), zero))
+            begins = f("and", begins, f("eq", _switching_rate(decided, graph, nodes, j), zero))
         for k in _find_bends(decided, slide):  # which are passed where what bends u has a rate
-            rests = f("eq", _rate(decided, graph, nodes, k), zero)
+            rests = f("eq", _switching_rate(decided, graph, nodes, k), zero)
             begins = f("and", begins, f("or", rests, f("ne", nodes[decided.pieces[k]], zero)))
         flags.append(f("select", begins, flag, one))
         pieces[j] = f("select", begins, piece, below)
@@ -109,7 +109,7 @@ def _find_bends(decided: DecidedProgram, slide: Slide) -> list[int]:
     return [k for k in signs if decided.pieces[k] in below]
 
 
-def _rate(decided: DecidedProgram, graph: Graph, nodes: list[int], j: int) -> int:
+def _switching_rate(decided: DecidedProgram, graph: Graph, nodes: list[int], j: int) -> int:
     """u̇ of the switching number of piece j, in a graph in which the nodes of the program are `nodes`."""
     n = decided.n
     slopes = gradient_in(graph, decided.line, nodes, decided.decisions[j].switch, range(2 * n + 1))

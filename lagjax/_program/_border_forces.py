@@ -96,7 +96,7 @@ class SlidingRows(NamedTuple):
         by_velocity = {i - n: x for i, x in slopes.items() if n <= i < 2 * n}
         return by_velocity, graph.apply("neg", node), level
 
-    def _sides(self, row: Row) -> tuple[dict[int, int], dict[int, int], float]:
+    def _nodes_of_sides(self, row: Row) -> tuple[dict[int, int], dict[int, int], float]:
         """The nodes that take the place of others below and above a border, and what part of the difference μ counts.
 
         Of a cone they are where its vector is zero and rests, and where it is tiny and has one part alone.
@@ -120,7 +120,7 @@ class SlidingRows(NamedTuple):
             entries.setdefault(x, []).append(i)
         acts = []
         for row in self.rows:
-            below, above, factor = self._sides(row)
+            below, above, factor = self._nodes_of_sides(row)
             among = sorted(needed.intersection(find_descendants(readers, above)))
             # A part of a vector at rest is not what it is on both sides: there the other parts are zero.
             for sides in ([below], [above]) if self.slides[row.slide].parts else ([below, above],):

@@ -162,15 +162,15 @@ def _find_borders(program: Recurrent, size: int, slides: bool, watched: int, bes
         decided = find_decisions(whole, size, slides, watched + count, beside)
         if decided is not None and decided.decisions and (kicking := find_kicking(decided, count)):
             again = functools.partial(find_decisions, whole, size, slides, watched + count, beside)
-            return _build(whole, decided, slides, again, count, kicking)
+            return _build_borders(whole, decided, slides, again, count, kicking)
     if _WITHOUT_ANY.issuperset(op for op, *_ in program.line.nodes):
         return None
     decided = find_decisions(program, size, slides, watched, beside)
     again = functools.partial(find_decisions, program, size, slides, watched, beside)
-    return decided and _build(program, decided, slides, again, 0, {})
+    return decided and _build_borders(program, decided, slides, again, 0, {})
 
 
-def _build(
+def _build_borders(
     program: Recurrent, decided: DecidedProgram, slides: bool, again: Callable, mechanics: int, kicking: dict
 ) -> Borders:
     """The borders of what has been decided, or is `again`, with one piece apart.

@@ -64,7 +64,7 @@ class Deciding(NamedTuple):
         for i in selects:
             condition, *branches = nodes[i][1]
             deciding = {j: self.compared(j) for j in find_ancestors(nodes, [condition])}
-            out |= {j for j, equal in deciding.items() if equal and any(self._vanishes(x, equal) for x in branches)}
+            out |= {j for j, equal in deciding.items() if equal and any(self._may_vanish(x, equal) for x in branches)}
             bases = {self.base(x) for x in branches} - at_zero
             at_zero |= bases
             selects += [x for x in bases if nodes[x][0] == "select"]
@@ -79,14 +79,14 @@ class Deciding(NamedTuple):
         abrupt = {self.compared(i) for i in out} - {None}
         return {i for i in needed if i in out or self.compared(i) in abrupt} - self.cones.keys()
 
-    def _vanishes(self, i: int, equal: frozenset[int]) -> bool:
+    def _may_vanish(self, i: int, equal: frozenset[int]) -> bool:
         """True if a node may be zero where these numbers are `equal`, or where the only one is zero."""
         op, operands, attribute = self.line.nodes[i]
         if op in ("input", "constant"):
             return equal == {i} or (attribute == 0.0 and op == "constant")
         if equal in ({self.base(i)}, {self.base(x) for x in operands}):
             return True
-        return (all if op in ("add", "sub") else any)(self._vanishes(x, equal) for x in operands)
+        return (all if op in ("add", "sub") else any)(self._may_vanish(x, equal) for x in operands)
 
     def compared(self, i: int) -> frozenset[int] | None:
         """The numbers that are equal at the border of a node, but for factors and zero; None of other nodes."""

@@ -59,7 +59,7 @@ class DecidedProgram(NamedTuple):
         return [decision.switch for decision in self.decisions]
 
 
-class _Switches:
+class _SwitchingNumbers:
     """The pieces of a graph whose first inputs `moves` tells; pieces are its inputs from the `first` one on.
 
     What the piece `apart` jumps with is written down once for each side of it, where that piece is the number `side`.
@@ -149,14 +149,14 @@ class _Switches:
         return None
 
 
-class _Rewriting:
+class _PieceRewriter:
     """The walk through a program, node by node: `places` says what each becomes in the graph with pieces."""
 
     def __init__(self, program: Recurrent, size: int, deciding: Deciding, apart: int | None):
         self.program, self.line, self.deciding = program, program.line, deciding
         self.graph = Graph(LARGEST_REWRITING * len(program.line.nodes) + 1000)
         moves = Moving(self.graph, 2 * size + 1)
-        self.switches = _Switches(self.graph, moves, program.size, apart)
+        self.switches = _SwitchingNumbers(self.graph, moves, program.size, apart)
         self.features = Features(self.graph, moves)
         self.parts: dict[int, tuple[int, ...]] = {}
         self.places: list[int] = []
@@ -192,11 +192,11 @@ class _Rewriting:
             if op in ("input", "constant"):
                 self.places.append(getattr(graph, op)(attribute, kind))
                 continue
-            decided = self._decide(i, op, of, attribute) if i in deciding.decisive else None
+            decided = self._result_by_piece(i, op, of, attribute) if i in deciding.decisive else None
             if decided is None and op in ("eq", "ne") and (sign := self._known_sign(i, *of)) is not None:
                 decided = graph.apply(op, sign, graph.number(0.0))
             if decided is None and op == "div":
-                decided = self._direction(*of)
+                decided = self._decide_direction(*of)
             if decided is None and i in deciding.abrupt and deciding.decides(i):
                 self._note_border(op, of)
             self.places.append(graph.node(op, *of, attribute=attribute) if decided is None else decided)
@@ -206,7 +206,7 @@ class _Rewriting:
             u = of[0] if op in ("abs", "sign") else self.graph.apply("sub", *of)
             self.features.note(self.graph.term(u)[1], UP_TO, 1.0)
 
-    def _decide(self, i: int, op: str, of: list[int], attribute) -> int | None:
+    def _result_by_piece(self, i: int, op: str, of: list[int], attribute) -> int | None:
         """The result of a node by its piece; None where it has none."""
         if i in self.deciding.cones:
             return self._decide_cone(i, op, of)
@@ -215,7 +215,7 @@ class _Rewriting:
             return None
         if op in (*COMPARISONS, "max", "min", "abs", "sign"):
             return self._decide_by_sign(op, of)
-        return self._angle(*of) if op == "atan2" else self._decide_by_whole(op, of, attribute)
+        return self._decide_angle(*of) if op == "atan2" else self._decide_by_whole(op, of, attribute)
 
     def _decide_by_sign(self, op: str, of: list[int]) -> int | None:
         f, zero = self.graph.apply, self.graph.number(0.0)
@@ -245,7 +245,7 @@ class _Rewriting:
             return f("sub", x, f("mul", whole, of[1]))
         return f("neg", whole) if op == "ceil" else f("convert", whole, attribute=attribute)
 
-    def _angle(self, y: int, x: int) -> int | None:
+    def _decide_angle(self, y: int, x: int) -> int | None:
         """atan2(y, x) by the side of its cut, y = 0 where x < 0; None where no motion crosses that.
 
         Only where x < 0 is y the switching number, so that an angle of zero is no border; at x = 0 nothing jumps.
@@ -304,7 +304,7 @@ class _Rewriting:
         says_moving = op == "ne" or op in (("gt", "ge") if is_first else ("lt", "le"))
         return moves if says_moving else f("not", moves)
 
-    def _direction(self, x: int, size: int) -> int | None:
+    def _decide_direction(self, x: int, size: int) -> int | None:
         """x / |x| as the piece of x, which has both sides at x = 0, too; None of other quotients.
 
         The size may be replaced by a number where it is zero, by `where`.
@@ -358,7 +358,7 @@ def find_decisions(
         i in deciding.cones or deciding.decides(i) or nodes[i][0] in WITH_FEATURES for i in relevant
     ):
         return None
-    rewriting = _Rewriting(program, size, deciding, apart)
+    rewriting = _PieceRewriter(program, size, deciding, apart)
     rewriting.place_nodes()
     for base, exponent in powers:
         rewriting.features.note_power(rewriting.places[base], exponent)

@@ -114,14 +114,14 @@ class Derivatives:
             op, operands, attribute = tape.nodes[k]
             if op == "input":
                 results[attribute] = g
-            rules_of = self._rules if once_more[k] else self._rules_once
+            rules_of = self._rules if once_more[k] else self._single_use_rules
             rules = rules_of(nodes[k], op, [nodes[x] for x in operands], attribute)
             for x, rule in zip(operands, rules, strict=False):
                 if rule is not None and varied[x]:
                     part = rule(g)
                     if (branch := taken[k]) is not None and taken[x] != branch:
-                        part = self._apply("select", nodes[branch], self._number(0.0), part)
-                    self._add(cotangents, same[x], part)
+                        part = self._apply_operation("select", nodes[branch], self._number(0.0), part)
+                    self._add_terms(cotangents, same[x], part)
         return [results.get(i, self._number(0.0)) for i in by]
 
     def slopes(self, output: int, through: Iterable[int], by: Sequence[int]) -> list[int]:
@@ -133,7 +133,7 @@ class Derivatives:
             op, operands, attribute = self.node_to_differentiate(i)
             for x, rule in zip(operands, self._rules(i, op, operands, attribute), strict=False):
                 if rule is not None and self.graph.value(x) is None:
-                    self._add(cotangents, x, rule(g))
+                    self._add_terms(cotangents, x, rule(g))
         return [cotangents.get(i, self._number(0.0)) for i in by]
 
     def _find_varying(self, tape: Tape, nodes: list[int], by: Sequence[int]) -> list[bool]:
@@ -156,11 +156,11 @@ class Derivatives:
         for i in self.find_ancestors(outputs) if tangents else ():
             if self.graph.kinds[i] == "float" and i not in tangents:
                 moved = not tangents.keys().isdisjoint(self.node_to_differentiate(i)[1])
-                if moved and (of_node := self._tangents(i, tangents)):
+                if moved and (of_node := self._node_tangents(i, tangents)):
                     tangents[i] = of_node
         return [tangents.get(i, {}) for i in outputs]
 
-    def _tangents(self, i: int, tangents: dict[int, Tangents]) -> Tangents:
+    def _node_tangents(self, i: int, tangents: dict[int, Tangents]) -> Tangents:
         (op, operands, attribute), result = self.node_to_differentiate(i), {}
         if op == "div" and all(x in tangents for x in operands):
             (u, v), found = operands, tangents
@@ -169,17 +169,17 @@ class Derivatives:
         for operand, rule in zip(operands, self._rules(i, op, operands, attribute), strict=False):
             if rule is not None:
                 for k, tangent in tangents.get(operand, {}).items():
-                    self._add(result, k, rule(tangent))
+                    self._add_terms(result, k, rule(tangent))
         return {k: tangent for k, tangent in result.items() if self.graph.value(tangent) != 0}
 
     def quotient_tangent(self, w: int, v: int, of_u: int | None, of_v: int | None) -> int:
         """(u′ − w v′)/v, the tangent of w = u / v: one division, where the two rules have two."""
         if of_v is None:
             assert of_u is not None
-            return self._apply("div", of_u, v)
-        part = self._apply("mul", w, of_v)
-        change = self._apply("neg", part) if of_u is None else self._apply("sub", of_u, part)
-        return self._mask_quotient(self._apply("div", change, v), w, v)
+            return self._apply_operation("div", of_u, v)
+        part = self._apply_operation("mul", w, of_v)
+        change = self._apply_operation("neg", part) if of_u is None else self._apply_operation("sub", of_u, part)
+        return self._mask_quotient(self._apply_operation("div", change, v), w, v)
 
     # ---- rules ----
 
@@ -187,15 +187,15 @@ class Derivatives:
         """The rules that take a cotangent, or a tangent, of each operand past w = op(operands); None: there is none."""
 
         def apply_rule(rule, g):
-            result = rule(self._apply, self._number, g, w, *operands)
+            result = rule(self._apply_operation, self._number, g, w, *operands)
             grows = self.hides and self.graph.hides_growth and any(map(self.graph.grows, (w, *operands)))
             if not grows:
                 return result
             if op == "div":
                 return self._mask_quotient(result, w, operands[1])
-            slope = rule(self._apply, self._number, self._number(1.0), w, *operands)
+            slope = rule(self._apply_operation, self._number, self._number(1.0), w, *operands)
             if op in FLAT_FAR_OUT:
-                result = self._mask(result, lambda: self.graph.is_flat_far_out(slope, operands[0]))
+                result = self._mask_nan(result, lambda: self.graph.is_flat_far_out(slope, operands[0]))
             elif op in SLOW_FAR_OUT:
                 result = self._refuse_overflow(result, g, w)
             return self._mask_product(result, g, slope)
@@ -203,12 +203,12 @@ class Derivatives:
         rules = OPERATIONS[op].transpose() if operands else ()
         if op in ("max", "min") and any(self.graph.nodes[x][0] == op for x in operands):
             u, v = operands
-            return [functools.partial(self._share, op, u, v), functools.partial(self._share, op, v, u)]
+            return [functools.partial(self._extreme_share, op, u, v), functools.partial(self._extreme_share, op, v, u)]
         return [rule and functools.partial(apply_rule, rule) for rule in rules]
 
-    def _share(self, op: str, u: int, v: int, g: int) -> int:
+    def _extreme_share(self, op: str, u: int, v: int, g: int) -> int:
         """The cotangent of the operand u of an extreme of several numbers: those that are equal have equal shares."""
-        f, counts = self._apply, [self._count_equal(op, x) for x in (u, v)]
+        f, counts = self._apply_operation, [self._count_equal(op, x) for x in (u, v)]
         shared = f("div", counts[0], f("add", *counts))
         whole = f("select", f("gt" if op == "max" else "lt", u, v), self._number(0.0), self._number(1.0))
         return f("mul", g, f("select", f("eq", u, v), whole, shared))
@@ -217,30 +217,30 @@ class Derivatives:
         """The count of the numbers that a node is the extreme of, and that are equal to it."""
         if self.graph.nodes[i][0] != op:
             return self._number(1.0)
-        f, (u, v) = self._apply, self.graph.nodes[i][1]
+        f, (u, v) = self._apply_operation, self.graph.nodes[i][1]
         of_u, of_v = (self._count_equal(op, x) for x in (u, v))
         one = f("select", f("gt" if op == "max" else "lt", u, v), of_v, of_u)
         return f("select", f("eq", u, v), one, f("add", of_u, of_v))
 
     def _mask_quotient(self, tangent: int, w: int, v: int) -> int:
         """A tangent, or a cotangent, of w = u/v: 0 where w is flat, as what has overflown gives no number."""
-        return self._mask(tangent, lambda: self.graph.is_flat_quotient(w, v)) if self.graph.grows(v) else tangent
+        return self._mask_nan(tangent, lambda: self.graph.is_flat_quotient(w, v)) if self.graph.grows(v) else tangent
 
     def _mask_product(self, product: int, g: int, slope: int) -> int:
         """A product of g and a slope, 0 where g is and the slope is huge."""
         if not (self.asks and self.hides and self.graph.hides_growth and self.graph.grows(slope)):
             return product
-        is_zero = self._apply("eq", g, self._number(0.0))
-        return self._mask(product, lambda: self._apply("and", is_zero, self.graph.is_huge(slope)))
+        is_zero = self._apply_operation("eq", g, self._number(0.0))
+        return self._mask_nan(product, lambda: self._apply_operation("and", is_zero, self.graph.is_huge(slope)))
 
-    def _mask(self, x: int, where: Callable[[], int]) -> int:
+    def _mask_nan(self, x: int, where: Callable[[], int]) -> int:
         """0 in the place of what is no number; what is finite stays, and has derivatives of its own."""
-        f, zero = self._apply, self._number(0.0)
+        f, zero = self._apply_operation, self._number(0.0)
         return f("select", f("is_finite", x), f("select", where(), x, zero), x)
 
     def _refuse_overflow(self, result: int, g: int, w: int) -> int:
         """NaN where w is infinite and matters: its operand has overflown, whose logarithm or root has a slope."""
-        f = self._apply
+        f = self._apply_operation
         known = f("or", f("is_finite", w), f("eq", g, self._number(0.0)))
         return f("select", known, self._number(math.nan), result)
 
@@ -250,19 +250,19 @@ class Derivatives:
             return [lambda g: self._power_derivative(operands[0], attribute, g)]
         return self.rules(w, op, operands)
 
-    def _rules_once(self, w: int, op: str, operands: Sequence[int], attribute: Any) -> Sequence[_Rule | None]:
+    def _single_use_rules(self, w: int, op: str, operands: Sequence[int], attribute: Any) -> Sequence[_Rule | None]:
         """`_rules` for the only cotangent of w: factors 2 and ½ are next to others, with which they cancel."""
         if op == "sqrt" and not self.graph.grows(w):
-            return [lambda g: self._apply("mul", self._number(0.5), self._apply("div", g, w))]
+            return [lambda g: self._apply_operation("mul", self._number(0.5), self._apply_operation("div", g, w))]
         if op == "mul" and operands[0] == operands[1]:
             return [lambda g: self._power_derivative(operands[0], 2, g)]
         return self._rules(w, op, operands, attribute)
 
     def _power_derivative(self, base: int, exponent: float, g: int) -> int:
         """p uᵖ⁻¹ g, which is finite at u = 0 where the products and roots that make up uᵖ have no derivative."""
-        lower = base if exponent == 2 else self._apply("pow", base, self._number(exponent - 1))
-        slope = self._apply("mul", self._number(exponent), lower)
-        return self._mask_product(self._apply("mul", g, slope), g, slope)
+        lower = base if exponent == 2 else self._apply_operation("pow", base, self._number(exponent - 1))
+        slope = self._apply_operation("mul", self._number(exponent), lower)
+        return self._mask_product(self._apply_operation("mul", g, slope), g, slope)
 
     # ---- the graph ----
 
@@ -279,12 +279,12 @@ class Derivatives:
     def size(self, outputs: Sequence[int]) -> int:
         return sum(bool(self.graph.nodes[i][1]) for i in self.graph.find_ancestors(outputs))
 
-    def _apply(self, op: str, *operands: int, attribute=None) -> int:
+    def _apply_operation(self, op: str, *operands: int, attribute=None) -> int:
         self.operations += 1
         return self.graph.apply(op, *operands, attribute=attribute)
 
-    def _add(self, parts: dict[int, int], i: int, part: int) -> None:
-        parts[i] = self._apply("add", parts[i], part) if i in parts else part
+    def _add_terms(self, parts: dict[int, int], i: int, part: int) -> None:
+        parts[i] = self._apply_operation("add", parts[i], part) if i in parts else part
 
 
 # ---- straight lines -------------------------------------------------------------------------------------------------
@@ -333,7 +333,7 @@ def pullback_and_entries(
         cotangents: dict[int, int] = {}
         for k, output in enumerate(of):
             if line.nodes[line.outputs[output]][0] != "constant":  # rows of contacts are zeros but for a few numbers
-                placed._add(cotangents, line.outputs[output], placed.graph.input(len(dtypes) + k, "float"))
+                placed._add_terms(cotangents, line.outputs[output], placed.graph.input(len(dtypes) + k, "float"))
         pulled, zero = placed.pull(cotangents, frozenset(by), tables, varies, is_linear), placed.graph.number(0.0)
         results = [*(pulled.get(i, zero) for i in by), *(i for _, *entry in tables for i in entry)]
         done = placed.finish_line(results, known, len(dtypes) + len(of))
@@ -442,7 +442,7 @@ class _PlacedLine(Derivatives):
             else:
                 for i, rule in zip(operands, self.rules(nodes[k], op, here), strict=False):
                     if rule is not None and i in tangents:
-                        self._add(parts, k, self._zero_where_zero(k, tangents[i], rule(tangents[i])))
+                        self._add_terms(parts, k, self._zero_where_zero(k, tangents[i], rule(tangents[i])))
             if k in parts and graph.value(parts[k]) != 0:
                 tangents[k] = parts[k]
         return tangents
@@ -472,14 +472,14 @@ class _PlacedLine(Derivatives):
             if g is None or k not in varied:
                 continue
             if op == "input":
-                self._add(results, attribute, g)
+                self._add_terms(results, attribute, g)
             elif op == "take" and attribute.first not in inputs:
                 assert tables is not None  # else the entry does not vary
                 tables.append((attribute, nodes[operands[0]], g))
             elif op == "take":
                 for i, position in enumerate(attribute.positions):
                     at = self.graph.apply("eq", nodes[operands[0]], self._number(float(i)))
-                    self._add(results, position, self.graph.apply("select", at, self._number(0.0), g))
+                    self._add_terms(results, position, self.graph.apply("select", at, self._number(0.0), g))
             else:
                 rules = self.rules(nodes[k], op, [nodes[j] for j in operands])
                 for i, rule in zip(operands, rules, strict=False):  # a step has no derivative at all
@@ -491,7 +491,7 @@ class _PlacedLine(Derivatives):
                         for p, branch in sorted(conditions[k] - conditions[i]):
                             cases = (part, self._number(0.0))[:: 1 if branch == 1 else -1]
                             part = self.graph.apply("select", nodes[p], *cases)
-                        self._add(cotangents, i, part)
+                        self._add_terms(cotangents, i, part)
         return results
 
     def _find_varying_nodes(
@@ -540,7 +540,7 @@ class _PlacedLine(Derivatives):
         """
         nodes, (op, operands, _) = self.line.nodes, self.line.nodes[k]
         by_root = op == "div" and (of := nodes[operands[1]][0]) not in ("input", "constant") and OPERATIONS[of].steep
-        if not (self.asks and (OPERATIONS[op].steep or by_root or (op == "div" and k in self._guarded))):
+        if not (self.asks and (OPERATIONS[op].steep or by_root or (op == "div" and k in self._find_guarded))):
             return part
         if k in self._roots_of_powers:
             part = self._select_unless_zero(self.nodes[operands[0]], part)
@@ -559,12 +559,12 @@ class _PlacedLine(Derivatives):
                 for root, u in parts.get(i, ()):
                     if op == "neg" or (op == "mul" and u not in factors[k]):
                         parts.setdefault(k, set()).add((root, u))
-                    elif op != "mul" and k not in self._guarded:
+                    elif op != "mul" and k not in self._find_guarded:
                         roots.discard(root)
         return roots
 
     @functools.cached_property
-    def _guarded(self) -> set[int]:
+    def _find_guarded(self) -> set[int]:
         """The nodes of products and quotients that the line asks whether they are finite."""
         guarded: set[int] = set()
         for k in range(len(self.nodes) - 1, -1, -1):

@@ -75,17 +75,17 @@ class Features:
             self.note(self.graph.scale(exponent, operands[0]), *_FUNCTIONS[op])
         elif exponent > 0:
             self.note(self.graph.apply("mul", base, base), GROWS, exponent / 2)
-        elif arguments := self._exponents(base):
+        elif arguments := self._moving_exponents(base):
             for u in arguments:
                 self.note(u, BESIDE, -exponent)
         else:
             self.note(base, FALLS, -exponent)
 
-    def _exponents(self, i: int) -> list[int]:
+    def _moving_exponents(self, i: int) -> list[int]:
         """The arguments of the exponentials that a sum consists of, but for what does not move; none of others."""
         op, operands, _ = self.graph.nodes[self.graph.term(i)[1]]
         if op in ("add", "sub"):
-            found = [self._exponents(x) for x in operands if self.moves(x)]
+            found = [self._moving_exponents(x) for x in operands if self.moves(x)]
             return [u for some in found for u in some] if all(found) else []
         return [operands[0]] if op in GROWING else []
 

@@ -54,99 +54,99 @@ class Formulas:
         self._written: dict[int, None] = {}  # the sums of the line, as atoms
         values: list[Sum] = []
         for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):
-            values.append(self._apply(op, [values[i] for i in operands], attribute, kind))
+            values.append(self._apply_operation(op, [values[i] for i in operands], attribute, kind))
             if op in ("add", "sub") and 1 < len(values[-1]) <= LONGEST_WRITTEN:
-                self._note(values[-1])
-        self.outputs = [self._shortest(values[i]) for i in line.outputs]
+                self._note_sum(values[-1])
+        self.outputs = [self._shortest_form(values[i]) for i in line.outputs]
 
-    def _atom(self, *of) -> int:
+    def _atom_id(self, *of) -> int:
         atom = Atom(*of)
         if atom not in self._ids:
             self._ids[atom] = len(self.atoms)
             self.atoms.append(atom)
         return self._ids[atom]
 
-    def _note(self, x: Sum) -> None:
+    def _note_sum(self, x: Sum) -> None:
         """Keep a sum in mind, without the factors that its terms share, if what is left has one factor in each."""
         shared = functools.reduce(lambda a, b: a & b, (set(product) for product in x))
         unit = {tuple(of for of in product if of not in shared): c for product, c in x.items()}
         if any(len(product) > 1 or any(self._opens(*of) for of in product) for product in unit):
             return
-        ((product, _),) = self._factor(unit, 1).items()
+        ((product, _),) = self._atom_of_sum(unit, 1).items()
         if len(product) == 1 and self.atoms[product[0][0]].kind == "sum":
             self._written[product[0][0]] = None
 
     # ---- the operations of the line ----
 
-    def _apply(self, op: str, xs: list[Sum], attribute, kind: str) -> Sum:
+    def _apply_operation(self, op: str, xs: list[Sum], attribute, kind: str) -> Sum:
         if op == "constant":
             return {ONE: attribute} if attribute else {}
         if op == "input":
-            return raised(self._atom("input", attribute))
+            return raised(self._atom_id("input", attribute))
         if op in ("add", "sub"):
             return add(xs[0], xs[1], 1.0 if op == "add" else -1.0)
         if op == "neg":
             return add({}, xs[0], -1.0)
         if op == "mul":
-            return self._multiply(*xs)
+            return self._multiply_sums(*xs)
         if op == "div" and kind == "float":
-            return self._multiply(xs[0], self._take_power(xs[1], -1))
+            return self._multiply_sums(xs[0], self._take_power(xs[1], -1))
         if op in ("sqrt", "rsqrt"):
             return self._take_power(xs[0], 0.5 if op == "sqrt" else -0.5)
         if op == "pow" and not xs[1].keys() - {ONE}:
             return self._take_power(xs[0], xs[1].get(ONE, 0.0))
         if op == "convert":
-            return xs[0] if kind in ("float", "bool") else self._function("trunc", xs)
+            return xs[0] if kind in ("float", "bool") else self._apply_function("trunc", xs)
         number = int(attribute) if op == "round" else -1 if attribute is None else hash(attribute)
-        return self._function(op, xs, number)
+        return self._apply_function(op, xs, number)
 
-    def _function(self, op: str, xs: list[Sum], number: int = -1) -> Sum:
-        xs, sign = [self._shortest(x) for x in xs], 1.0
+    def _apply_function(self, op: str, xs: list[Sum], number: int = -1) -> Sum:
+        xs, sign = [self._shortest_form(x) for x in xs], 1.0
         rule = OPERATIONS[op].simplify
-        if rule in (odd, even) and xs[0] and xs[0][min(xs[0], key=self._lead)] < 0:
+        if rule in (odd, even) and xs[0] and xs[0][min(xs[0], key=self._term_rank)] < 0:
             xs, sign = [add({}, xs[0], -1.0)], -1.0 if rule is odd else 1.0
-        return {((self._atom(op, number, tuple(map(freeze, xs))), 1),): sign}
+        return {((self._atom_id(op, number, tuple(map(freeze, xs))), 1),): sign}
 
-    def _multiply(self, a: Sum, b: Sum) -> Sum:
+    def _multiply_sums(self, a: Sum, b: Sum) -> Sum:
         """A product; a sum of several terms stays one factor, unless the other factor is a number."""
         if not (a.keys() - {ONE} and b.keys() - {ONE}):
             return multiply(a, b)
-        return multiply(*(x if len(x) == 1 else self._factor(x, 1) for x in (a, b)))
+        return multiply(*(x if len(x) == 1 else self._atom_of_sum(x, 1) for x in (a, b)))
 
-    def _factor(self, x: Sum, power: float) -> Sum:
+    def _atom_of_sum(self, x: Sum, power: float) -> Sum:
         """A sum in a power, as one atom, without what its coefficients have in common: its first term is positive."""
-        if len(x := self._shortest(x)) == 1:
+        if len(x := self._shortest_form(x)) == 1:
             return self._take_power(x, power)
         sizes = {abs(c) for c in x.values()}
         size = sizes.pop() if len(sizes) == 1 else 1.0
-        if power == int(power) and x[min(x, key=self._lead)] < 0:
+        if power == int(power) and x[min(x, key=self._term_rank)] < 0:
             size = -size
         unit = {product: c / size for product, c in x.items()}
-        return {((self._atom("sum", -1, (freeze(unit),)), power),): size**power}
+        return {((self._atom_id("sum", -1, (freeze(unit),)), power),): size**power}
 
-    def _lead(self, product: Product) -> tuple:
+    def _term_rank(self, product: Product) -> tuple:
         """The place of a term in a sum: coordinates, numbers, others."""
         moves = any(self.atoms[a].kind == "input" and not self._is_parameter(a) for a, _ in product)
         return not moves, product != ONE, product
 
     def _take_power(self, x: Sum, power: float) -> Sum:
         if len(x) != 1:
-            return self._factor(x, power) if x else raised(self._atom("sum", -1, ((),)), power)
+            return self._atom_of_sum(x, power) if x else raised(self._atom_id("sum", -1, ((),)), power)
         ((product, c),) = x.items()
         plain = len(product) == 1 and product[0][1] == 1 and c == 1
         if power == int(power) or plain or (not product and c > 0):
             return {tuple((atom, power * p) for atom, p in product): c**power}
-        return raised(self._atom("sum", -1, (freeze(x),)), power)
+        return raised(self._atom_id("sum", -1, (freeze(x),)), power)
 
     # ---- the shortest form ----
 
-    def _shortest(self, x: Sum) -> Sum:
+    def _shortest_form(self, x: Sum) -> Sum:
         for product in [product for product in x if len(product) == 1 and product[0][1] == 1]:
             if self.atoms[product[0][0]].kind == "sum":
                 c = x[product]
                 x = {key: value for key, value in x.items() if key != product}
                 x = add(x, dict(self.atoms[product[0][0]].operands[0]), c)
-        forms = [self._join_angles(x), self._gather(self._join_angles(self._multiply_out(x)))]
+        forms = [self._join_angles(x), self._gather_factors(self._join_angles(self._multiply_out(x)))]
         return min(forms, key=self.length)
 
     def length(self, x: Sum) -> int:
@@ -182,25 +182,25 @@ class Formulas:
     # ---- sines and cosines ----
 
     def _join_angles(self, x: Sum) -> Sum:
-        while (joined := next(filter(None, (self._joined(x, product) for product in x)), None)) is not None:
+        while (joined := next(filter(None, (self._join_products(x, product) for product in x)), None)) is not None:
             x = joined
         return x
 
-    def _joined(self, x: Sum, product: Product) -> Sum | None:
+    def _join_products(self, x: Sum, product: Product) -> Sum | None:
         """The sum with two of its products in one: `product`, and that with the other functions of both angles."""
-        turns = [a for a, p in product for _ in range(min(2, int(p)) if p > 0 else 0) if self._is_turn(a)]
+        turns = [a for a, p in product for _ in range(min(2, int(p)) if p > 0 else 0) if self._is_angle_function(a)]
         for a, b in itertools.combinations(turns, 2):
             rest = multiply({product: 1.0}, multiply(raised(a, -1), raised(b, -1)))
-            others = multiply(*(raised(self._other(of)) for of in (a, b)))
+            others = multiply(*(raised(self._co_function(of)) for of in (a, b)))
             (partner,) = multiply(rest, others)
             if partner == product or abs(x[product]) != abs(x.get(partner, 0.0)):
                 continue
-            if (joined := self._turn_of(a, b, x[product], x[partner])) is not None:
+            if (joined := self._angle_sum(a, b, x[product], x[partner])) is not None:
                 left = {key: c for key, c in x.items() if key not in (product, partner)}
                 return add(left, multiply(rest, joined), 1.0)
         return None
 
-    def _turn_of(self, a: int, b: int, c: float, d: float) -> Sum | None:
+    def _angle_sum(self, a: int, b: int, c: float, d: float) -> Sum | None:
         """c f(a) g(b) + d f′(a) g′(b) as one function, with the other functions f′ and g′; None where it is none."""
         (f, u), (g, v) = ((self.atoms[k].kind, dict(self.atoms[k].operands[0])) for k in (a, b))
         if u == v and (f != g or c != d):
@@ -210,22 +210,22 @@ class Formulas:
         else:  # sin cos ± cos sin
             u, v = (u, v) if f == "sin" else (v, u)
             op, angle, size = "sin", add(u, v, 1.0 if c == d else -1.0), c
-        return multiply(self._function(op, [angle]), {ONE: size}) if angle else {ONE: size}
+        return multiply(self._apply_function(op, [angle]), {ONE: size}) if angle else {ONE: size}
 
-    def _is_turn(self, atom: int) -> bool:
+    def _is_angle_function(self, atom: int) -> bool:
         return self.atoms[atom].kind in ("sin", "cos")
 
-    def _other(self, atom: int) -> int:
+    def _co_function(self, atom: int) -> int:
         of = self.atoms[atom]
-        return self._atom("cos" if of.kind == "sin" else "sin", of.position, of.operands)
+        return self._atom_id("cos" if of.kind == "sin" else "sin", of.position, of.operands)
 
     # ---- sums that are factors ----
 
-    def _gather(self, x: Sum) -> Sum:
+    def _gather_factors(self, x: Sum) -> Sum:
         """The sum with factors of several terms: sums that were written, and sums of parameters."""
         for atom in sorted(self._written, key=lambda a: -len(self.atoms[a].operands[0])):
             terms = dict(self.atoms[atom].operands[0])
-            while (found := _multiple(x, terms)) is not None:
+            while (found := _common_multiple(x, terms)) is not None:
                 shorter = self._replace(x, multiply(found, terms), multiply(found, raised(atom)))
                 if shorter is None or x.keys() == terms.keys():
                     break
@@ -238,9 +238,9 @@ class Formulas:
                     groups.setdefault(rest, {})[((atom, 1),)] = c
         rest, group = max(groups.items(), key=lambda of: (len(of[1]), len(of[0])), default=(ONE, {}))
         if len(group) > 1:
-            new = multiply({rest: 1.0}, self._factor(group, 1))
+            new = multiply({rest: 1.0}, self._atom_of_sum(group, 1))
             if (shorter := self._replace(x, multiply({rest: 1.0}, group), new)) is not None:
-                return self._gather(shorter)
+                return self._gather_factors(shorter)
         return x
 
     def _replace(self, x: Sum, old: Sum, new: Sum) -> Sum | None:
@@ -285,7 +285,7 @@ def multiply(a: Sum, b: Sum) -> Sum:
     return result
 
 
-def _multiple(x: Sum, terms: Sum) -> Sum | None:
+def _common_multiple(x: Sum, terms: Sum) -> Sum | None:
     """One product, with its coefficient, by which these terms are all in a sum."""
     (lead, first), *others = terms.items()
     for product, c in x.items():

@@ -48,7 +48,7 @@ Node = tuple[str, tuple[int, ...], Any]
 _ONE = ("float", 1.0, 1.0)  # the key of the constant 1
 
 
-def _cancel(a: float, b: float) -> bool:
+def _have_cancelled(a: float, b: float) -> bool:
     """True for large constants whose sum is so small that what they were added to has been rounded."""
     return abs(a + b) < 1e-8 * abs(a) and abs(a) > 1e8
 
@@ -89,7 +89,7 @@ def find_descendants(readers: Sequence[Sequence[int]], starts: Iterable[int]) ->
     return sorted(found)
 
 
-class _Collected(NamedTuple):
+class _NodeIndex(NamedTuple):
     """The products and sums of a graph, known by what they consist of."""
 
     factors: dict[int, tuple[int, ...]]  # of each product
@@ -113,7 +113,7 @@ class Graph:
         self.budget = budget
         self._operations = 0
         self._ids: dict = {}
-        self._collected = _Collected({}, {}, {}, {}, set())
+        self._collected = _NodeIndex({}, {}, {}, {}, set())
         self.powers: dict[int, tuple[int, float]] = {}  # what is a power of another node, and which
         self._arrays: dict[bytes, int] = {}  # long arrays of numbers, and where their ids begin
         self.floats: dict[int, int] = {}  # integers that are indices, as floats
@@ -156,21 +156,21 @@ class Graph:
     def is_huge(self, v: int) -> int:
         """True where v is so large that its coefficients may be infinite: the square of 1/v is zero."""
         first = len(self.nodes)
-        return self._bound(first, self._is_nothing(self.apply("div", self.constant(1.0, "float"), v)))
+        return self._check_growth(first, self._is_zero(self.apply("div", self.constant(1.0, "float"), v)))
 
     def has_coefficients(self, v: int) -> int:
         """True where v is neither huge nor NaN."""
         first, zero = len(self.nodes), self.constant(0.0, "float")
         inverse = self.apply("div", self.constant(1.0, "float"), v)
-        return self._bound(first, self.apply("prefers", self.apply("mul", inverse, inverse), zero))
+        return self._check_growth(first, self.apply("prefers", self.apply("mul", inverse, inverse), zero))
 
     def finite_part(self, v: int) -> int:
         has_any, first = self.has_coefficients(v), len(self.nodes)
-        return self._bound(first, self.apply("select", has_any, self.constant(0.0, "float"), v))
+        return self._check_growth(first, self.apply("select", has_any, self.constant(0.0, "float"), v))
 
     def is_flat_quotient(self, w: int, v: int) -> int:
         """True where w = u/v is nothing as v is huge."""
-        return self.apply("and", self.is_huge(v), self._is_nothing(w))
+        return self.apply("and", self.is_huge(v), self._is_zero(w))
 
     def is_flat_far_out(self, slope: int, u: int) -> int:
         """The node of a flag: true where u is huge and slope · u is zero.
@@ -181,10 +181,10 @@ class Graph:
         changes = self.apply("prefers", self.apply("mul", change, change), self.constant(0.0, "float"))
         return self.apply("and", self.is_huge(u), self.apply("not", changes))
 
-    def _is_nothing(self, x: int) -> int:
+    def _is_zero(self, x: int) -> int:
         return self.apply("eq", self.apply("mul", x, x), self.constant(0.0, "float"))
 
-    def _bound(self, first: int, result: int) -> int:
+    def _check_growth(self, first: int, result: int) -> int:
         """The result, where nodes from the `first` one on do not grow."""
         self.grows(first - 1)
         self._growing += [False] * (len(self.nodes) - first)
@@ -202,7 +202,7 @@ class Graph:
             if self.nodes[i][0] != "constant":
                 break
         else:
-            return self._fold(op, operands, attribute)
+            return self._fold_constants(op, operands, attribute)
         if rule := OPERATIONS[op].simplify:
             return rule(self, op, *operands) if attribute is None else rule(self, op, *operands, attribute)
         return self.node(op, *operands, attribute=attribute)
@@ -224,12 +224,12 @@ class Graph:
             return node
         self._operations += 1
         self._require_room()
-        return self._append(key, key, self._kind(op, operands, attribute))
+        return self._append_node(key, key, self._result_kind(op, operands, attribute))
 
     def input(self, index: int, kind: str) -> int:
         node = ("input", (), index)
         known = self._ids.get(node)
-        return self._append(node, node, kind) if known is None else known
+        return self._append_node(node, node, kind) if known is None else known
 
     def real(self, i: int) -> int:
         """The node of an id that may stand for an input or a number without one."""
@@ -268,7 +268,7 @@ class Graph:
         key = (kind, value, math.copysign(1.0, value))  # 0.0 and -0.0 are equal but not the same
         if (node := self._ids.get(key)) is not None:
             return node
-        return self._append(key, ("constant", (), value), kind)
+        return self._append_node(key, ("constant", (), value), kind)
 
     def number(self, x: float) -> int:
         return self.constant(x, "float")
@@ -281,18 +281,18 @@ class Graph:
         """`x` if node `i` is `op(x)`, else None."""
         return self.nodes[i][1][0] if self.nodes[i][0] == op else None
 
-    def _append(self, key, node: Node, kind: str) -> int:
+    def _append_node(self, key, node: Node, kind: str) -> int:
         self.nodes.append(node)
         self.kinds.append(kind)
         self._ids[key] = len(self.nodes) - 1
         return self._ids[key]
 
-    def _fold(self, op: str, operands: tuple[int, ...], attribute: Any) -> int:
+    def _fold_constants(self, op: str, operands: tuple[int, ...], attribute: Any) -> int:
         if op in LOOK_UPS:
             return self._fold_look_up(op, operands[0], attribute)
         values = [np.dtype(self.kinds[i]).type(self.nodes[i][2]) for i in operands]
         extra = () if attribute is None else (attribute,)
-        return self.constant(OPERATIONS[op].value(*values, *extra), self._kind(op, operands, attribute))
+        return self.constant(OPERATIONS[op].value(*values, *extra), self._result_kind(op, operands, attribute))
 
     def _fold_look_up(self, op: str, x: int, attribute: Any) -> int:
         """A look-up at a number: an entry is that input, or a number."""
@@ -303,7 +303,7 @@ class Graph:
             return self.node(op, x, attribute=attribute)
         return self.input(table.positions[int(min(max(value, 0), table.count - 1))], "float")
 
-    def _kind(self, op: str, operands: tuple[int, ...], attribute: Any) -> str:
+    def _result_kind(self, op: str, operands: tuple[int, ...], attribute: Any) -> str:
         if OPERATIONS[op].is_logical:
             return "bool"
         return attribute if op == "convert" else self.kinds[operands[-1]]
@@ -330,7 +330,7 @@ class Graph:
         if coefficient == 1:
             return base
         if self.value(base) is not None:
-            return self._fold("mul", (self.constant(coefficient, "float"), base), None)
+            return self._fold_constants("mul", (self.constant(coefficient, "float"), base), None)
         return self.node("mul", self.constant(coefficient, "float"), base)
 
     # Products and sums are known by what they consist of, whatever order they were written in.
@@ -360,7 +360,7 @@ class Graph:
         """`a + sign*b` with like terms collected, or an earlier sum of the same terms."""
         left, right = self.terms(a), self.terms(b)
         one = self._ids.get(_ONE)
-        if one in left and one in right and _cancel(left[one], sign * right[one]):
+        if one in left and one in right and _have_cancelled(left[one], sign * right[one]):
             return self._round_by_adding(a, b, sign)
         terms = dict(left)
         for base, coefficient in right.items():
@@ -460,8 +460,8 @@ class Tape(Graph):
 
     def apply(self, op: str, *operands: int, attribute=None) -> int:
         if all(self.nodes[i][0] == "constant" for i in operands):
-            return self._fold(op, operands, attribute)
-        return self._append_operation(op, operands, attribute, self._kind(op, operands, attribute))
+            return self._fold_constants(op, operands, attribute)
+        return self._append_operation(op, operands, attribute, self._result_kind(op, operands, attribute))
 
     def power(self, a: int, exponent: int) -> int:
         """The scalar `a**exponent`, as one node."""

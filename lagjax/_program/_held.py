@@ -114,7 +114,7 @@ class Held:
         onto. Then pivots move alone, by what rounding and one step of Newton's have left.
         """
         f, state, n, pushed_of = self.graph.apply, self.state, self.n, dict(zip(which, pushed, strict=True))
-        left = zip(which, self._evaluate(levels), strict=True)
+        left = zip(which, self._evaluate_held(levels), strict=True)
         changes = solve([f("select", pushed_of[k], self.zero, level) for k, level in left])
         multiples = dict(zip(which, changes, strict=True))
         for i, of in enumerate(self.of_coordinates):
@@ -123,7 +123,7 @@ class Held:
             along = [f("select", pushed_of[k], self.zero, of[k]) for k in some]
             moves = dot(self.graph, along, [multiples[k] for k in some])
             state[first + i] = f("sub", state[first + i], moves)
-        left, moved = dict(zip(which, self._evaluate(levels), strict=True)), [self.zero] * n
+        left, moved = dict(zip(which, self._evaluate_held(levels), strict=True)), [self.zero] * n
         for k, i, divisor in self.divisors:
             if k in left:
                 row = self.slopes[k]
@@ -132,7 +132,7 @@ class Held:
                 state[first + i] = f("select", pushed_of[k], before, f("add", before, change))
                 moved[i] = f("add", moved[i], f("select", pushed_of[k], self.zero, change))
 
-    def _evaluate(self, nodes: Sequence[int]) -> list[int]:
+    def _evaluate_held(self, nodes: Sequence[int]) -> list[int]:
         graph = self.graph
         line = eliminate_dead_code(graph, nodes)
         places = copy_nodes(graph, line, lambda i, _: self.state.get(i))

@@ -214,7 +214,7 @@ def jump_at_border(
             f"derivatives of order {len(directions)} over a border are not known, of {len(_STAGES)} they are"
         )
     with np.errstate(all="ignore"):
-        return _OverBorder(borders, size, directions, member, over_steps).build()
+        return _JumpBuilder(borders, size, directions, member, over_steps).build()
 
 
 class _Jets:
@@ -256,7 +256,7 @@ class _Jets:
         return result
 
 
-class _OverBorder:
+class _JumpBuilder:
     """The jump in one graph, in which numbers are jets."""
 
     def __init__(self, borders: Borders, size: int, directions: tuple[int, ...], member: int, over_steps: bool):
@@ -304,7 +304,7 @@ class _OverBorder:
             rows *= 1 + count
         return line
 
-    def _values(self, line: StraightLine, place: list[Jet], fixed: Sequence[int]) -> list[Jet]:
+    def _jet_values(self, line: StraightLine, place: list[Jet], fixed: Sequence[int]) -> list[Jet]:
         """The outputs of one of the lines with rows at a place; `fixed` are the inputs that do not move."""
         zero = self.graph.number(0.0)
         inputs = [zero if jet[row] is None else jet[row] for row in range(self.jets.rows) for jet in place]
@@ -314,15 +314,15 @@ class _OverBorder:
 
     # ---- flows ----
 
-    def _rates(self, place: list[Jet], pieces: Sequence[int]) -> list[Jet]:
+    def _moving_rates(self, place: list[Jet], pieces: Sequence[int]) -> list[Jet]:
         """The rates of all that moves: q̇, q̈, 1 of the time, 0 of parameters."""
         unused = [self.graph.number(0.0)] * self.chosen
         none: Jet = [None] * self.jets.rows
         one: Jet = [self.graph.number(1.0), *none[1:]]
-        acceleration = self._values(self.field, place, [*pieces, *unused])
+        acceleration = self._jet_values(self.field, place, [*pieces, *unused])
         return [*place[self.n : 2 * self.n], *acceleration, one, *[none] * self.numbers]
 
-    def _flow(self, place: list[Jet], pieces: Sequence[int], delay: Jet) -> list[Jet]:
+    def _flow_jets(self, place: list[Jet], pieces: Sequence[int], delay: Jet) -> list[Jet]:
         jets, rates, stages = self.jets, [], _STAGES[len(self.jets.directions) - 1]
         for weights in stages:
             here = place
@@ -331,49 +331,49 @@ class _OverBorder:
                     here = [jets.add(x, jets.multiply(delay, r), weight) for x, r in zip(here, rate, strict=True)]
             if len(weights) == len(stages) - 1:
                 return here
-            rates.append(self._rates(here, pieces))
+            rates.append(self._moving_rates(here, pieces))
         raise AssertionError
 
-    def _delay(self, place: list[Jet], before: Sequence[int], hit: Sequence[int], rate: int) -> Jet:
+    def _delay_jets(self, place: list[Jet], before: Sequence[int], hit: Sequence[int], rate: int) -> Jet:
         """δ, order by order: what is left of u is due to the highest one."""
         delay: Jet = [None] * self.jets.rows
         for order in range(1, 1 + max(self.jets.orders)):
-            there = place if order == 1 else self._flow(place, before, delay)
-            (left,) = self._values(self.switches, there, [*before, *hit])
+            there = place if order == 1 else self._flow_jets(place, before, delay)
+            (left,) = self._jet_values(self.switches, there, [*before, *hit])
             for row in range(self.jets.rows):
                 if self.jets.orders[row] == order:
                     delay[row] = self.graph.apply("neg", self.graph.apply("div", left[row], rate))
         return delay
 
     @property
-    def _lower(self) -> int:
+    def _lower_jets(self) -> int:
         return self.jets.rows // (1 + self.jets.directions[-1])
 
     def build(self) -> Jump:
         graph, n, zero = self.graph, self.n, self.graph.number(0.0)
-        place, before, behind, hit = self._inputs()
+        place, before, behind, hit = self._jump_inputs()
         base = [jet[0] for jet in place]
-        first = self._rates(place, before)
+        first = self._moving_rates(place, before)
         a_before = [first[n + i][0] for i in range(n)]
-        a_behind = [jet[0] for jet in self._rates(place, behind)[n : 2 * n]]
+        a_behind = [jet[0] for jet in self._moving_rates(place, behind)[n : 2 * n]]
         nodes = copy_nodes(graph, self.switch, [*base, *before, *hit])
         rates = [*base[n : 2 * n], *a_before, graph.number(1.0)]
         rate = tangents_in(graph, self.switch, nodes, dict(enumerate(rates)), {}).get(self.switch.outputs[0], zero)
-        delay = self._delay(place, before, hit, rate)
-        there = self._flow(place, before, delay)
+        delay = self._delay_jets(place, before, hit, rate)
+        there = self._flow_jets(place, before, delay)
         if self.kick is not None:
-            there[n : 2 * n] = self._values(self.kick, there, [*before, *behind, *hit])
-        back = self._flow(there, behind, [None if x is None else graph.apply("neg", x) for x in delay])
+            there[n : 2 * n] = self._jet_values(self.kick, there, [*before, *behind, *hit])
+        back = self._flow_jets(there, behind, [None if x is None else graph.apply("neg", x) for x in delay])
         results = []
         for row in range(1, self.jets.rows):
             for x, y in zip(place[: 2 * n], back[: 2 * n], strict=True):
                 results.append(zero if y[row] is None else graph.apply("sub", y[row], x[row]))
         line = eliminate_dead_code(graph, [*results, *a_before, *a_behind])
-        return Jump(line, self.jets.orders, self._lower, 2 * self.pieces + self.chosen)
+        return Jump(line, self.jets.orders, self._lower_jets, 2 * self.pieces + self.chosen)
 
-    def _inputs(self) -> tuple[list[Jet], list[int], list[int], list[int]]:
+    def _jump_inputs(self) -> tuple[list[Jet], list[int], list[int], list[int]]:
         """The inputs of the result, in the order of `Jump`: the jets of all that moves, and pieces."""
-        n, numbers, lower, m = self.n, self.numbers, self._lower, self.pieces
+        n, numbers, lower, m = self.n, self.numbers, self._lower_jets, self.pieces
         rows, count = self.jets.rows, itertools.count()
         upper = rows - lower
 

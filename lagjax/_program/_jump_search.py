@@ -29,27 +29,27 @@ class BothSides:
         self.graph, self.line = graph, line
         self.before = copy_nodes(graph, line)
         self.behind = copy_nodes(graph, line, lambda i, _: None if i < size else graph.input(i + m, "float"))
-        self._differences: dict[int, int] = {}
+        self._node_differences: dict[int, int] = {}
 
     def difference(self, i: int) -> int:
         """The node behind the border less that before it: terms that are alike do not cost its digits."""
         stack = [i]
         while stack:
             k = stack[-1]
-            if k in self._differences:
+            if k in self._node_differences:
                 stack.pop()
                 continue
-            missing = [x for x in self._parts(k) if x not in self._differences]
+            missing = [x for x in self._differing_operands(k) if x not in self._node_differences]
             if missing:
                 stack += missing
             else:
-                self._differences[k] = self._subtract(k)
+                self._node_differences[k] = self._subtract_sides(k)
                 stack.pop()
-        return self._differences[i]
+        return self._node_differences[i]
 
-    def _parts(self, k: int) -> list[int]:
+    def _differing_operands(self, k: int) -> list[int]:
         """The operands from whose differences that of a node follows."""
-        (op, operands, _), same = self.line.nodes[k], self._same
+        (op, operands, _), same = self.line.nodes[k], self._is_unchanged
         if same(k):
             return []
         if op in ("add", "sub", "neg", "mul"):
@@ -58,16 +58,16 @@ class BothSides:
             return [operands[0]]
         return list(operands[1:]) if op == "select" and same(operands[0]) else []
 
-    def _same(self, k: int) -> bool:
+    def _is_unchanged(self, k: int) -> bool:
         return self.before[k] == self.behind[k]
 
-    def _subtract(self, k: int) -> int:
-        f, (op, operands, _), parts = self.graph.apply, self.line.nodes[k], self._parts(k)
-        if self._same(k):
+    def _subtract_sides(self, k: int) -> int:
+        f, (op, operands, _), parts = self.graph.apply, self.line.nodes[k], self._differing_operands(k)
+        if self._is_unchanged(k):
             return self.graph.constant(0.0, "float")
         if not parts:
             return f("sub", self.behind[k], self.before[k])
-        changes = [self._differences[x] for x in parts]
+        changes = [self._node_differences[x] for x in parts]
         if op == "mul":
             a, b = operands
             return f("add", f("mul", changes[0], self.behind[b]), f("mul", self.before[a], changes[1]))
@@ -85,7 +85,7 @@ class JumpSearch:
         located = [a for op, _, a in (*line.nodes, *decide.nodes) if op in LOOK_UPS]
         tables = [table for table in map(table_of, located) if table.numbers is None]
         self.beside = self.size + 3 * self.m  # where numbers that are only looked up stand, behind all other inputs
-        self.line, self.decide = self._shift(line), self._shift(decide)
+        self.line, self.decide = self._shift_look_ups(line), self._shift_look_ups(decide)
         self.draw, self.tables = np.random.default_rng(0), [self._near(table) for table in dict.fromkeys(tables)]
 
     def _near(self, attribute):
@@ -94,11 +94,11 @@ class JumpSearch:
         beside = table.numbers is None and table.first >= BESIDE
         return shift_look_up(attribute, self.beside - BESIDE) if beside else attribute
 
-    def _shift(self, line: StraightLine) -> StraightLine:
+    def _shift_look_ups(self, line: StraightLine) -> StraightLine:
         nodes = ((op, of, self._near(a) if op in LOOK_UPS else a) for op, of, a in line.nodes)
         return line.replace(nodes=tuple(nodes))
 
-    def _states(self, count: int) -> np.ndarray:
+    def _draw_states(self, count: int) -> np.ndarray:
         """Random states; entries of tables that are parameters increase."""
         ends = [1 + max(table.positions) for table in self.tables]
         columns = self.draw.uniform(0.3, 1.2, (max([self.beside, *ends]), count))
@@ -107,7 +107,7 @@ class JumpSearch:
             columns[table.positions] = np.sort(self.draw.uniform(-1.5, 1.5, (table.count, count)), axis=0)
         return columns
 
-    def _decide(self, columns: np.ndarray, given: np.ndarray, pieces: np.ndarray) -> np.ndarray:
+    def _decide_pieces(self, columns: np.ndarray, given: np.ndarray, pieces: np.ndarray) -> np.ndarray:
         """The pieces (m, S) of states; piece `given` (S,) of each is one of `pieces` (S,), where that is not NaN."""
         m, first, states = self.m, self.size, np.arange(columns.shape[1])
         columns = columns.copy()
@@ -122,7 +122,7 @@ class JumpSearch:
         """For each of these pieces: whether any of the nodes jumps with it; None where no state is on its border."""
         with np.errstate(all="ignore"):
             columns, near, blocks = self._locate_borders(candidates)
-            values = np.array(self._differences(nodes).evaluate(list(columns)))
+            values = np.array(self._node_differences(nodes).evaluate(list(columns)))
         change, noise = np.abs(values[: len(nodes)]), values[len(nodes) :]
         known = near & np.isfinite(change).all(axis=0) & np.isfinite(noise).all(axis=0)
         jumps = known & (change > _NOISE * _EPS * noise).any(axis=0)
@@ -133,7 +133,7 @@ class JumpSearch:
 
     def find_zeros(self, candidates: Sequence[int], node: int) -> list[bool]:
         """For each of these pieces: whether the node is zero on one side of its border, wherever that is found."""
-        line = self._with_rounding(eliminate_dead_code(self.line, [node]), 1)
+        line = self._add_rounding(eliminate_dead_code(self.line, [node]), 1)
         with np.errstate(all="ignore"):
             columns, near, blocks = self._locate_borders(candidates)
             m, size = self.m, self.size
@@ -149,16 +149,16 @@ class JumpSearch:
     def _locate_borders(self, candidates) -> tuple[np.ndarray, np.ndarray, list[slice]]:
         """States on the borders of pieces, with the pieces of both sides; which are there, and which are of each."""
         m, size = self.m, self.size
-        columns, given = self._states(_STATES * len(candidates)), np.repeat(candidates, _STATES)
-        lines, target = [self._distance(j) for j in candidates], np.full((3, len(given)), np.nan)
+        columns, given = self._draw_states(_STATES * len(candidates)), np.repeat(candidates, _STATES)
+        lines, target = [self._switching_distance(j) for j in candidates], np.full((3, len(given)), np.nan)
         blocks = [slice(k * _STATES, (k + 1) * _STATES) for k in range(len(candidates))]
         for turn in range(_ROUNDS):
-            columns[size : size + m] = self._decide(columns, given, np.full(len(given), np.nan))
+            columns[size : size + m] = self._decide_pieces(columns, given, np.full(len(given), np.nan))
             for j, line, block in zip(candidates, lines, blocks, strict=True):
                 here = columns[:, block]
                 if not turn:
                     u = line.evaluate(list(here))[0]
-                    target[:, block] = self.decisions[j].levels_near(u, self._entries(here), self.draw)
+                    target[:, block] = self.decisions[j].levels_near(u, self._table_entries(here), self.draw)
                 for _ in range(_STEPS):
                     u, _, *slopes = line.evaluate(list(here))
                     step = (u - target[0, block]) / sum(s * s for s in slopes)
@@ -168,10 +168,10 @@ class JumpSearch:
             u, error, *_ = line.evaluate(list(columns[:, block]))
             near[block] = np.abs(u - target[0, block]) <= _HIT * _EPS * (error + np.abs(target[0, block]))
         for side in range(2):
-            columns[size + side * m : size + (side + 1) * m] = self._decide(columns, given, target[1 + side])
+            columns[size + side * m : size + (side + 1) * m] = self._decide_pieces(columns, given, target[1 + side])
         return columns, near, blocks
 
-    def _entries(self, columns: np.ndarray) -> Callable:
+    def _table_entries(self, columns: np.ndarray) -> Callable:
         def entries(located, index: np.ndarray) -> np.ndarray:
             table = self._near(table_of(located))
             if table.numbers is not None:
@@ -180,19 +180,19 @@ class JumpSearch:
 
         return entries
 
-    def _differences(self, nodes: Sequence[int]) -> StraightLine:
+    def _node_differences(self, nodes: Sequence[int]) -> StraightLine:
         """The differences of nodes on both sides, and the rounding errors of these."""
         graph = Graph(_LARGEST_SEARCH * len(self.line.nodes) + 10_000)
         sides = BothSides(graph, self.line, self.size, self.m)
         changes = [sides.difference(i) for i in nodes]
-        return self._with_rounding(eliminate_dead_code(graph, changes), len(changes))
+        return self._add_rounding(eliminate_dead_code(graph, changes), len(changes))
 
-    def _distance(self, j: int) -> StraightLine:
+    def _switching_distance(self, j: int) -> StraightLine:
         """Switching number j, its rounding error, and its slopes by q, q̇ and t."""
         line = eliminate_dead_code(self.line, [self.decisions[j].switch])
-        return self._with_rounding(line, 1, range(self.moving))
+        return self._add_rounding(line, 1, range(self.moving))
 
-    def _with_rounding(self, line: StraightLine, count: int, by: Sequence[int] = ()) -> StraightLine:
+    def _add_rounding(self, line: StraightLine, count: int, by: Sequence[int] = ()) -> StraightLine:
         graph = Graph(_LARGEST_SEARCH * len(line.nodes) + 10_000)
         places = copy_nodes(graph, line)
         errors = rounding(graph, line, places, self.moving)

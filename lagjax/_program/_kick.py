@@ -134,12 +134,12 @@ def kick_of(
         change = f("ne", graph.input(size + j, "float"), graph.input(size + m + j, "float"))
         passes, bent = f("or", passes, change), f("or", bent, change) if j in corners else bent
     kicked, is_enough = _kick_velocities(graph, sides, mechanics, slopes, passes)
-    bent = f("and", bent, _turns(graph, sides, mechanics, n)) if corners else bent
+    bent = f("and", bent, _rate_jumps(graph, sides, mechanics, n)) if corners else bent
     kicked = [f("select", bent, x, graph.number(math.nan)) for x in kicked]
     return Kick(eliminate_dead_code(graph, [*kicked, is_enough]), tuple(kicking))
 
 
-def _turns(graph: Graph, sides: BothSides, of: Mechanics, n: int) -> int:
+def _rate_jumps(graph: Graph, sides: BothSides, of: Mechanics, n: int) -> int:
     """True where a rate of a constraint jumps at this state: elsewhere a piece may bend it that is none of it here."""
     f, turns = graph.apply, graph.constant(False, "bool")
     for k, rate in enumerate(of.rates):
@@ -161,7 +161,7 @@ def _kick_velocities(
     v, normal, by_time = [graph.input(n + i, "float") for i in range(n)], slopes[:n], slopes[n]
     change_p, change_l = [sides.difference(i) for i in mechanics.momentum], sides.difference(mechanics.lagrangian)
     rates, mass = [behind[i] for i in mechanics.rates], [behind[i] for i in mechanics.mass_matrix]
-    solve = _saddle(graph, mass, [behind[i] for i in mechanics.jacobian], n)
+    solve = _solve_saddle(graph, mass, [behind[i] for i in mechanics.jacobian], n)
     d, minus_lambda = solve([f("neg", x) for x in change_p], [f("neg", x) for x in rates])
     w = [f("add", x, y) for x, y in zip(v, d, strict=True)]
     across, _ = solve(normal, [zero] * len(rates))
@@ -183,7 +183,7 @@ def _kick_velocities(
     return kicked, f("select", f("lt", squared, zero), one, zero)
 
 
-def _saddle(graph: Graph, mass: Sequence[int], jacobian: Sequence[int], n: int):
+def _solve_saddle(graph: Graph, mass: Sequence[int], jacobian: Sequence[int], n: int):
     """`(r, c)`: d and −λ with M d − Gᵀλ = r, G d = c."""
     m, zero = len(jacobian) // n if n else 0, graph.constant(0.0, "float")
     rows = [[*mass[i * n : (i + 1) * n], *(jacobian[k * n + i] for k in range(m))] for i in range(n)]

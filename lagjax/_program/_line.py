@@ -58,11 +58,11 @@ class StraightLine:
         """The outputs at many states, shape (outputs, S). Values are dropped as soon as nothing needs them."""
         columns, precision, count = self._prepare_columns(columns)
         results = np.empty((len(self.outputs), count), precision)
-        steps = self._steps(precision)
+        steps = self._numpy_steps(precision)
         with np.errstate(all="ignore"):
             for start in range(0, count, CHUNK):
                 part = columns if count <= CHUNK else [_cut(x, slice(start, start + CHUNK)) for x in columns]
-                values = _values(steps, part)
+                values = _node_values(steps, part)
                 for row, i in enumerate(self.outputs):
                     results[row, start : start + CHUNK] = values[i]
         return results
@@ -78,8 +78,8 @@ class StraightLine:
         columns, precision, count = self._prepare_columns(columns)
         states = max([count, *[np.size(x) for x in cotangents]])
         inputs: list = [None] * len(columns)
-        for part in self._parts(states):
-            values = _values(self._steps(precision), [_cut(x, part) for x in columns], keep=True)
+        for part in self._line_parts(states):
+            values = _node_values(self._numpy_steps(precision), [_cut(x, part) for x in columns], keep=True)
             flows: dict[int, Any] = {}
             for i, cotangent in zip(self.outputs, cotangents, strict=True):
                 if cotangent is not None and self.kinds[i] == "float":
@@ -95,11 +95,11 @@ class StraightLine:
                     if inputs[i] is None:
                         inputs[i] = np.zeros(states, precision)
                     inputs[i][part] += x
-                for i, partial in self._partials(k, values):
+                for i, partial in self._scaled_partials(k, values):
                     flows[i] = flows.get(i, 0.0) + partial(flow)
         return inputs
 
-    def _partials(self, k: int, values: Sequence) -> Iterator[tuple[int, Callable]]:
+    def _scaled_partials(self, k: int, values: Sequence) -> Iterator[tuple[int, Callable]]:
         """The float operands of node k that are no constants, each with x ↦ x ∂node/∂operand at these values."""
         op, operands, _ = self.nodes[k]
         of = [values[i] for i in operands]
@@ -107,14 +107,14 @@ class StraightLine:
             if partial is not None and self.kinds[i] == "float" and self.nodes[i][0] != "constant":
                 yield i, lambda x, partial=partial: partial(apply_in_numpy, float, x, values[k], *of)
 
-    def _parts(self, states: int) -> list[slice]:
+    def _line_parts(self, states: int) -> list[slice]:
         size = max(1, min(CHUNK, _MOST_KEPT // (1 + len(self.nodes))))
         return [slice(start, min(start + size, states)) for start in range(0, states, size)]
 
     # ---- what is derived from it ----
 
     @functools.cached_property
-    def _steps(self) -> Callable[[np.dtype], list]:
+    def _numpy_steps(self) -> Callable[[np.dtype], list]:
         """Its calls of NumPy one after the other, by precision: they take longer to write down than to do."""
         return functools.cache(functools.partial(_steps_of, self))
 
@@ -172,7 +172,7 @@ def _steps_of(line: StraightLine, precision) -> list[tuple[Callable | None, tupl
     return steps
 
 
-def _values(steps: list, columns: Sequence, keep: bool = False) -> list:
+def _node_values(steps: list, columns: Sequence, keep: bool = False) -> list:
     values: list = [None] * len(steps)
     for k, (function, operands, (is_input, attribute), dropped) in enumerate(steps):
         if function is None:

@@ -123,7 +123,7 @@ def _refuse_look_up(x, attribute):
     raise TypeError("a look-up has no value without its table")
 
 
-def _binade(x):
+def _power_of_two(x):
     power = np.where(x == 0, 1, np.ldexp(np.ones_like(x), np.frexp(x)[1] - 1))
     return np.where(np.isfinite(x), power, np.abs(x))[()]
 
@@ -180,14 +180,14 @@ def _result(f, c, w, *operands):
     return w
 
 
-def _where(f, condition, yes, no):
+def _choose_value(f, condition, yes, no):
     return f("select", condition, no, yes)
 
 
 def _share(f, c, g, larger, smaller):
     """The cotangent of the operand `larger` of a maximum: all of g where it is that, a half of it where both are."""
-    whole = _where(f, f("gt", larger, smaller), c(1.0), c(0.0))
-    return f("mul", g, _where(f, f("eq", larger, smaller), c(0.5), whole))
+    whole = _choose_value(f, f("gt", larger, smaller), c(1.0), c(0.0))
+    return f("mul", g, _choose_value(f, f("eq", larger, smaller), c(0.5), whole))
 
 
 def _power_by_base(f, c, g, w, u, v):
@@ -196,12 +196,12 @@ def _power_by_base(f, c, g, w, u, v):
     It has a slope in the exponent there, so that no more is left out than 0 · ∞.
     """
     undefined = f("and", f("eq", u, c(0.0)), f("eq", v, c(0.0)))
-    return f("mul", g, _where(f, undefined, c(0.0), f("mul", v, f("pow", u, f("sub", v, c(1.0))))))
+    return f("mul", g, _choose_value(f, undefined, c(0.0), f("mul", v, f("pow", u, f("sub", v, c(1.0))))))
 
 
 def _power_by_exponent(f, c, g, w, u, v):
     """The cotangent of the exponent of a power: zero where the base is zero."""
-    return f("mul", g, f("mul", w, f("log", _where(f, f("eq", u, c(0.0)), c(1.0), u))))
+    return f("mul", g, f("mul", w, f("log", _choose_value(f, f("eq", u, c(0.0)), c(1.0), u))))
 
 
 # ---- rows that are alike ---------------------------------------------------------------------------------------------
@@ -232,7 +232,7 @@ def _intrinsic(name: str) -> Callable:
     return lambda code, *xs: code.intrinsic(name, *xs)
 
 
-def _function(name: str, value: Callable, slope: Callable, llvm: str | Callable | None = None, **rest) -> Operation:
+def _smooth_map(name: str, value: Callable, slope: Callable, llvm: str | Callable | None = None, **rest) -> Operation:
     """A smooth function of one number; in machine code that of the C library, where nothing else is said."""
     return Operation(name, 1, value, name if llvm is None else llvm, slopes=(slope,), **rest)
 
@@ -285,30 +285,30 @@ _ROWS = (
         cotangents=(_power_by_base, _power_by_exponent),
     ),
     # Roots
-    _function("sqrt", np.sqrt, lambda f, c, w, u: f("div", c(0.5), w), _intrinsic("sqrt"), steep=True,
+    _smooth_map("sqrt", np.sqrt, lambda f, c, w, u: f("div", c(0.5), w), _intrinsic("sqrt"), steep=True,
               simplify=_simplify.root, recurrence=_recurrences.square_root),
-    _function("rsqrt", lambda x: 1 / np.sqrt(x), lambda f, c, w, u: f("div", f("mul", c(-0.5), w), u),
+    _smooth_map("rsqrt", lambda x: 1 / np.sqrt(x), lambda f, c, w, u: f("div", f("mul", c(-0.5), w), u),
               lambda code, a: 1.0 / code.intrinsic("sqrt", a), simplify=_simplify.root, c="1.0 / sqrt({0})"),
-    _function("cbrt", np.cbrt, lambda f, c, w, u: f("div", w, f("mul", c(3.0), u)), simplify=_odd, steep=True),
+    _smooth_map("cbrt", np.cbrt, lambda f, c, w, u: f("div", w, f("mul", c(3.0), u)), simplify=_odd, steep=True),
     # Exponentials
-    _function("exp", np.exp, lambda f, c, w, u: w),
-    _function("exp2", np.exp2, lambda f, c, w, u: f("mul", c(math.log(2.0)), w)),
-    _function("expm1", np.expm1, lambda f, c, w, u: _one_plus(f, c, w)),
-    _function("log", np.log, lambda f, c, w, u: _inverse(f, c, u)),
-    _function("log1p", np.log1p, lambda f, c, w, u: _inverse(f, c, _one_plus(f, c, u))),
-    _function("logistic", lambda x: 1 / (1 + np.exp(-x)), lambda f, c, w, u: f("sub", w, _square(f, w)),
+    _smooth_map("exp", np.exp, lambda f, c, w, u: w),
+    _smooth_map("exp2", np.exp2, lambda f, c, w, u: f("mul", c(math.log(2.0)), w)),
+    _smooth_map("expm1", np.expm1, lambda f, c, w, u: _one_plus(f, c, w)),
+    _smooth_map("log", np.log, lambda f, c, w, u: _inverse(f, c, u)),
+    _smooth_map("log1p", np.log1p, lambda f, c, w, u: _inverse(f, c, _one_plus(f, c, u))),
+    _smooth_map("logistic", lambda x: 1 / (1 + np.exp(-x)), lambda f, c, w, u: f("sub", w, _square(f, w)),
               lambda code, a: 1.0 / (1.0 + code.library("exp", -a)), c="1.0 / (1.0 + exp(-{0}))"),
-    _function("erf", np.vectorize(math.erf, otypes=[float]), lambda f, c, w, u: _gauss(f, c, u), simplify=_odd),
-    _function("erfc", np.vectorize(math.erfc, otypes=[float]), lambda f, c, w, u: f("neg", _gauss(f, c, u))),
+    _smooth_map("erf", np.vectorize(math.erf, otypes=[float]), lambda f, c, w, u: _gauss(f, c, u), simplify=_odd),
+    _smooth_map("erfc", np.vectorize(math.erfc, otypes=[float]), lambda f, c, w, u: f("neg", _gauss(f, c, u))),
     # Circular functions
-    _function("sin", np.sin, lambda f, c, w, u: f("cos", u), simplify=_odd),
-    _function("cos", np.cos, lambda f, c, w, u: f("neg", f("sin", u)), simplify=_even),
-    _function("tan", np.tan, lambda f, c, w, u: _one_plus(f, c, _square(f, w)), simplify=_odd),
-    _function("asin", np.arcsin, lambda f, c, w, u: _inverse_root(f, c, _one_minus_square(f, c, u)),
+    _smooth_map("sin", np.sin, lambda f, c, w, u: f("cos", u), simplify=_odd),
+    _smooth_map("cos", np.cos, lambda f, c, w, u: f("neg", f("sin", u)), simplify=_even),
+    _smooth_map("tan", np.tan, lambda f, c, w, u: _one_plus(f, c, _square(f, w)), simplify=_odd),
+    _smooth_map("asin", np.arcsin, lambda f, c, w, u: _inverse_root(f, c, _one_minus_square(f, c, u)),
               simplify=_odd, steep=True),
-    _function("acos", np.arccos, lambda f, c, w, u: f("neg", _inverse_root(f, c, _one_minus_square(f, c, u))),
+    _smooth_map("acos", np.arccos, lambda f, c, w, u: f("neg", _inverse_root(f, c, _one_minus_square(f, c, u))),
               steep=True),
-    _function("atan", np.arctan, lambda f, c, w, u: _inverse(f, c, _one_plus(f, c, _square(f, u))), simplify=_odd),
+    _smooth_map("atan", np.arctan, lambda f, c, w, u: _inverse(f, c, _one_plus(f, c, _square(f, u))), simplify=_odd),
     Operation(
         "atan2", 2, np.arctan2, "atan2", simplify=_simplify.angle, steep=True,
         slopes=(
@@ -318,13 +318,13 @@ _ROWS = (
         side=lambda f, c, w, y, x: f("and", f("lt", x, c(0.0)), f("lt", y, c(0.0))),
     ),
     # Hyperbolic functions
-    _function("sinh", np.sinh, lambda f, c, w, u: f("cosh", u), simplify=_odd),
-    _function("cosh", np.cosh, lambda f, c, w, u: f("sinh", u), simplify=_even),
-    _function("tanh", np.tanh, lambda f, c, w, u: _one_minus_square(f, c, w), simplify=_odd),
-    _function("asinh", np.arcsinh, lambda f, c, w, u: _inverse_root(f, c, _one_plus(f, c, _square(f, u))),
+    _smooth_map("sinh", np.sinh, lambda f, c, w, u: f("cosh", u), simplify=_odd),
+    _smooth_map("cosh", np.cosh, lambda f, c, w, u: f("sinh", u), simplify=_even),
+    _smooth_map("tanh", np.tanh, lambda f, c, w, u: _one_minus_square(f, c, w), simplify=_odd),
+    _smooth_map("asinh", np.arcsinh, lambda f, c, w, u: _inverse_root(f, c, _one_plus(f, c, _square(f, u))),
               simplify=_odd),
-    _function("acosh", np.arccosh, lambda f, c, w, u: _inverse_root(f, c, _square_minus_one(f, c, u)), steep=True),
-    _function("atanh", np.arctanh, lambda f, c, w, u: _inverse(f, c, _one_minus_square(f, c, u)), simplify=_odd),
+    _smooth_map("acosh", np.arccosh, lambda f, c, w, u: _inverse_root(f, c, _square_minus_one(f, c, u)), steep=True),
+    _smooth_map("atanh", np.arctanh, lambda f, c, w, u: _inverse(f, c, _one_minus_square(f, c, u)), simplify=_odd),
     # Pieces
     Operation(
         "abs", 1, np.abs, _intrinsic("fabs"), simplify=_even, exact=True, recurrence=_recurrences.absolute,
@@ -352,7 +352,7 @@ _ROWS = (
     # The largest power of two that is at most |x|, and 1 for 0: for weights that do not change what is computed with
     # them. It has therefore no side: no step has to end where it jumps.
     Operation(
-        "binade", 1, _binade,
+        "binade", 1, _power_of_two,
         lambda code, x: code.library("exp2", code.library("logb", code.select(code.compare("==", x, 0.0), 1.0, x))),
         is_step=True, exact=True, c="exp2(logb({0} == 0.0 ? 1.0 : {0}))",
     ),
@@ -363,8 +363,8 @@ _ROWS = (
         simplify=_simplify.select, exact=True, recurrence=_recurrences.select,
         cotangents=(
             None,
-            lambda f, c, g, w, p, no, yes: _where(f, p, c(0.0), g),
-            lambda f, c, g, w, p, no, yes: _where(f, p, g, c(0.0)),
+            lambda f, c, g, w, p, no, yes: _choose_value(f, p, c(0.0), g),
+            lambda f, c, g, w, p, no, yes: _choose_value(f, p, g, c(0.0)),
         ),
         c="({0} ? {2} : {1})", text="where({0}, {2}, {1})",
         latex=r"\begin{{cases}} {2} & {0} \\ {1} & \text{{otherwise}} \end{{cases}}",

@@ -21,15 +21,15 @@ def factor(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
         if graph.kinds[i] != "float":
             return None
         if op == "mul" and any([uses[x] == 1 and graph.nodes[x][0] == "mul" for x in operands]):
-            return _square_first(new, [moved(x) for x in _factors(graph, uses, i)])
+            return _multiply_squares_first(new, [moved(x) for x in _product_factors(graph, uses, i)])
         if op in ("add", "sub") and (uses[operands[0]] == 1 or uses[operands[1]] == 1):
             return _common_factor(new, op, *(moved(x) for x in operands))
         return None
 
-    return _rewritten(graph, outputs, uses, node_of, Graph.apply)
+    return _rewrite_graph(graph, outputs, uses, node_of, Graph.apply)
 
 
-def _rewritten(graph, outputs, uses, node_of: Callable, make: Callable) -> tuple[Graph, list[int]]:
+def _rewrite_graph(graph, outputs, uses, node_of: Callable, make: Callable) -> tuple[Graph, list[int]]:
     """A graph with `node_of(new, i, moved)` in the place of every node i for which that is not None, and the outputs.
 
     `moved(x)` says where a node before i is. The others are made anew by `make`, so that all is compared once more.
@@ -48,7 +48,7 @@ def _rewritten(graph, outputs, uses, node_of: Callable, make: Callable) -> tuple
     return new, [places[i] for i in outputs]
 
 
-def _factors(graph, uses, i) -> list[int]:
+def _product_factors(graph, uses, i) -> list[int]:
     """The factors of a product, looking into products that have no other use, a few at most."""
     factors, k = list(graph.nodes[i][1]), 0
     while k < len(factors):
@@ -60,7 +60,7 @@ def _factors(graph, uses, i) -> list[int]:
     return factors
 
 
-def _square_first(graph, factors) -> int | None:
+def _multiply_squares_first(graph, factors) -> int | None:
     """Their product, if one of them comes twice."""
     counts = Counter(factors)
     if any(graph.value(x) is not None and n > 1 for x, n in counts.items()):  # constants that overflow, or underflow
@@ -96,12 +96,12 @@ def sink_negations(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
 
     def node_of(new, i, moved):
         op, operands, _ = graph.nodes[i]
-        return _negative(new, moved(*operands)) if op == "neg" and uses[operands[0]] == 1 else None
+        return _cheap_negative(new, moved(*operands)) if op == "neg" and uses[operands[0]] == 1 else None
 
-    return _rewritten(graph, outputs, uses, node_of, Graph.node)
+    return _rewrite_graph(graph, outputs, uses, node_of, Graph.node)
 
 
-def _negative(graph, i) -> int | None:
+def _cheap_negative(graph, i) -> int | None:
     """`-i` without an operation more than `i` itself, if there is such a thing."""
     op, operands, _ = graph.nodes[i]
     if op == "sub":

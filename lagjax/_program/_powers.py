@@ -40,7 +40,7 @@ class Power(NamedTuple):
 
 def find_powers(line: StraightLine, nodes: Iterable[int], guards: set[int], size: int) -> list[Power]:
     """The powers to watch among these nodes of a program of q, q̇, t and parameters; guards depend on some of them."""
-    program, found = _Products(line, sorted(nodes), size), {}
+    program, found = _ProductFactors(line, sorted(nodes), size), {}
     for i in program.users:
         for base, e in program.factors.get(i, {}).items():
             if e >= LEAST_POWER or (e < 0 and program.is_hidden(base, i, i in guards)):
@@ -48,7 +48,7 @@ def find_powers(line: StraightLine, nodes: Iterable[int], guards: set[int], size
     return [Power(base, e if grows else -e) for (base, grows), e in sorted(found.items())]
 
 
-class _Products:
+class _ProductFactors:
     """The numbers of a program as products: what they are products of, of what moves; and what uses whole products.
 
     A number that moves and has no `factors` here is its own.
@@ -74,7 +74,7 @@ class _Products:
             if op not in steps and not self._moving.isdisjoint(operands):
                 self._moving.add(i)
                 if is_product:
-                    self.factors[i] = self._multiply(i, op, operands)
+                    self.factors[i] = self._multiply_factors(i, op, operands)
         self.holders: dict[int, list[int]] = {}
         for i in self.users:
             for base in self.factors_of(i):
@@ -84,7 +84,7 @@ class _Products:
         """The bases of a number, each with its exponent; none of one that does not move."""
         return self.factors.get(i) or ({i: 1.0} if i in self._moving else {})
 
-    def _multiply(self, i: int, op: str, operands: tuple[int, ...]) -> dict[int, float]:
+    def _multiply_factors(self, i: int, op: str, operands: tuple[int, ...]) -> dict[int, float]:
         factors = dict(self.factors_of(operands[0]))
         if op in ("mul", "div"):
             for base, e in self.factors_of(operands[1]).items():

@@ -116,24 +116,24 @@ class _Recurrences:
         self.hides_growth = self.zeroth_order.hides_growth
         *_, self.k, self.inverse_k = (self.order_recursion.input(i, "float") for i in range(moving + 2))
         self._given: dict[tuple, int] = {}  # what else is read: ("value", node) or ("product", row, row)
-        self._rows: dict[tuple[int | _Component, bool], int] = {}
-        self._coefficients: dict[int, int | _Unknown | None] = {}  # None: constant along the motion
+        self._rows: dict[tuple[int | _SolutionComponent, bool], int] = {}
+        self._coefficients: dict[int, int | _UnknownSeries | None] = {}  # None: constant along the motion
         self.steep: set[int] = set()  # slopes that may be infinite where the function itself is not
         # Of an elimination no coefficient is needed: it is most of a large program.
         linear = program.linear
-        self._find((linear and linear.read) or list(program.line.outputs[:size]))
+        self._find_coefficients((linear and linear.read) or list(program.line.outputs[:size]))
         self._find_added(len(program.line.nodes))
-        self.solution = [] if program.linear is None else self._solution(program.linear)
+        self.solution = [] if program.linear is None else self._solution_coefficients(program.linear)
         if program.linear is not None:  # what is followed may depend on it
             self._coefficients = dict(zip(program.linear.z, self.solution, strict=True)) | self._coefficients
         added = len(self.zeroth_order.nodes)
-        self._find(list(followed))
+        self._find_coefficients(list(followed))
         self._find_added(added)
         done = 0
         while done < len(self._rows):  # a derivative may be a number that nothing else needed
             new, done = list(self._rows)[done:], len(self._rows)
             for of, _ in new:
-                if not isinstance(of, _Component):
+                if not isinstance(of, _SolutionComponent):
                     self.coefficient(of)
 
     def _find_added(self, first: int) -> None:
@@ -150,29 +150,29 @@ class _Recurrences:
             return self.order_recursion.number(number)
         if self.hides_growth and self.zeroth_order.grows(node):
             node = self.zeroth_order.finite_part(node)
-        return self._input("value", node)
+        return self._input_node("value", node)
 
-    def cauchy_product(self, a: int, b: "int | _Component", by_order: bool = False) -> int:
+    def cauchy_product(self, a: int, b: "int | _SolutionComponent", by_order: bool = False) -> int:
         """Σ' aⱼ bₖ₋ⱼ, or Σ' j aⱼ bₖ₋ⱼ."""
-        first, second = self._row(a, by_order), self._row(b, False)
-        return self._input("product", min(first, second), max(first, second))
+        first, second = self._coefficient_row(a, by_order), self._coefficient_row(b, False)
+        return self._input_node("product", min(first, second), max(first, second))
 
-    def _row(self, node: "int | _Component", by_order: bool) -> int:
+    def _coefficient_row(self, node: "int | _SolutionComponent", by_order: bool) -> int:
         return self._rows.setdefault((node, by_order), len(self._rows))
 
-    def _input(self, *key) -> int:
+    def _input_node(self, *key) -> int:
         if key not in self._given:
             self._given[key] = self.order_recursion.input(self.moving + 2 + len(self._given), "float")
         return self._given[key]
 
     # ---- the recurrences ----
 
-    def coefficient(self, i: int) -> "int | _Unknown | None":
+    def coefficient(self, i: int) -> "int | _UnknownSeries | None":
         if i not in self._coefficients:
-            self._find([i])
+            self._find_coefficients([i])
         return self._coefficients[i]
 
-    def _find(self, roots: list[int]) -> None:
+    def _find_coefficients(self, roots: list[int]) -> None:
         """The coefficients of these nodes, and before them those of what they depend on."""
         missing, stack = set(), list(roots)
         while stack:
@@ -186,7 +186,7 @@ class _Recurrences:
                 c = choose(self, self.zeroth_order.has_coefficients(i), self.order_recursion.number(0.0), c)
             self._coefficients[i] = c
 
-    def _coefficient(self, i: int) -> "int | _Unknown | None":
+    def _coefficient(self, i: int) -> "int | _UnknownSeries | None":
         op, operands, attribute = self.zeroth_order.nodes[i]
         if op == "input":
             return self.order_recursion.input(attribute, "float") if attribute < self.moving else None
@@ -196,12 +196,12 @@ class _Recurrences:
         used = of[1:] if op == "select" else of
         if all(c is None for c in used):
             return None
-        unknown = [c for c in used if isinstance(c, _Unknown)]
+        unknown = [c for c in used if isinstance(c, _UnknownSeries)]
         if unknown:
             return unknown[0]
         if rule := OPERATIONS[op].recurrence:
             return rule(self, i, operands, of)
-        return self.apply_slopes(i, operands, of) if OPERATIONS[op].slopes else _Unknown(op)
+        return self.apply_slopes(i, operands, of) if OPERATIONS[op].slopes else _UnknownSeries(op)
 
     def apply_slopes(self, i, operands, of):
         """w = f(u, …) by its partial derivatives."""
@@ -227,7 +227,7 @@ class _Recurrences:
 
     # ---- a linear system: the coefficients of its solution, without those of its elimination ----
 
-    def _solution(self, system) -> list[int]:
+    def _solution_coefficients(self, system) -> list[int]:
         """The coefficients zₖ where A z = r: A₀ zₖ = rₖ − Aₖ z₀ − Σ' Aⱼ zₖ₋ⱼ, solved with the factors of A₀."""
         apply = self.order_recursion.apply
         residual = [self._output_coefficient(node) for node in system.right]
@@ -237,11 +237,11 @@ class _Recurrences:
                 c = self._output_coefficient(node)
                 for row, column in places:
                     taken = apply("mul", c, self.value(system.z[column]))
-                    taken = apply("add", taken, self.cauchy_product(node, _Component(column)))
+                    taken = apply("add", taken, self.cauchy_product(node, _SolutionComponent(column)))
                     residual[row] = apply("sub", residual[row], taken)
-        return self._inline(system.solve(), system.factors, residual)
+        return self._inline_line(system.solve(), system.factors, residual)
 
-    def _inline(self, line: StraightLine, factors, right: list[int]) -> list[int]:
+    def _inline_line(self, line: StraightLine, factors, right: list[int]) -> list[int]:
         """The outputs of a line of factors (order zero) and a right-hand side (order k), as recursion nodes."""
         places: list[tuple[bool, int]] = []  # whether of the zeroth order, and which node
 
@@ -303,22 +303,22 @@ class _Recurrences:
 
     def _output_coefficient(self, node: int) -> int:
         c = self.coefficient(node)
-        if isinstance(c, _Unknown):
+        if isinstance(c, _UnknownSeries):
             raise Unlowerable(f"`{c.op}` has no Taylor series here")
         return self.order_recursion.number(0.0) if c is None else c
 
-    def _row_coefficient(self, node: "int | _Component", by_order: bool) -> int:
-        c = self.solution[node.i] if isinstance(node, _Component) else self._output_coefficient(node)
+    def _row_coefficient(self, node: "int | _SolutionComponent", by_order: bool) -> int:
+        c = self.solution[node.i] if isinstance(node, _SolutionComponent) else self._output_coefficient(node)
         return self.order_recursion.apply("mul", self.k, c) if by_order else c
 
 
-class _Component(NamedTuple):
+class _SolutionComponent(NamedTuple):
     """Component i of the solution of the linear system, as the owner of a row."""
 
     i: int
 
 
-class _Unknown(NamedTuple):
+class _UnknownSeries(NamedTuple):
     """No series: which operation is to blame."""
 
     op: str

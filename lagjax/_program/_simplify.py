@@ -50,10 +50,12 @@ def multiply(graph, op, a, b):
     for constant, other in ((a, b), (b, a)):
         if (value := graph.value(constant)) is not None and value == value:
             coefficient, base = graph.term(other)
-            return graph.scale(value * coefficient, base) if _fits(value, coefficient) else graph.node("mul", a, b)
+            return (
+                graph.scale(value * coefficient, base) if _is_in_range(value, coefficient) else graph.node("mul", a, b)
+            )
     (m, x), (n, y) = graph.term(a), graph.term(b)
     if (
-        abs(m) != 1 and abs(n) != 1 and _fits(m, n)
+        abs(m) != 1 and abs(n) != 1 and _is_in_range(m, n)
     ):  # two constant factors become one; a single one stays where it can be shared
         return graph.scale(m * n, graph.product(x, y))
     if m < 0 or n < 0:
@@ -65,7 +67,7 @@ def multiply(graph, op, a, b):
     return graph.product(a, b)
 
 
-def _fits(m: float, n: float) -> bool:
+def _is_in_range(m: float, n: float) -> bool:
     """True where the product of two constants neither overflows nor underflows: what they multiply may not, either."""
     return not (m and n) or 1e-290 < abs(m * n) < math.inf or abs(n) == 1
 
@@ -253,15 +255,15 @@ def angle(graph, op, y, x):
     u, v = graph.operand_of("sin", sine), graph.operand_of("cos", cosine)
     if u is None or u != v or abs(m) != n:
         return graph.node(op, y, x)
-    return graph.scale(math.copysign(1.0, m), _rest(graph, u, 2 * math.pi))
+    return graph.scale(math.copysign(1.0, m), _period_remainder(graph, u, 2 * math.pi))
 
 
 def arctangent(graph, u: int) -> int:
     """atan(u). Where u is y/x, and x may change its sign, this is atan2(±y, ±x): it jumps at x = 0, and is no pole."""
     f, zero, one = graph.apply, graph.constant(0.0, "float"), graph.constant(1.0, "float")
     if (angle := graph.operand_of("tan", u)) is not None:
-        return _rest(graph, angle, math.pi)
-    y, x = _quotient(graph, u, _DEEPEST)
+        return _period_remainder(graph, angle, math.pi)
+    y, x = _split_quotient(graph, u, _DEEPEST)
     if x is None or graph.value(x) is not None:
         return f("atan", u)
     sign = f("select", f("lt", x, zero), one, graph.constant(-1.0, "float"))
@@ -279,13 +281,13 @@ def inverse(graph, x: int, op: str) -> int:
             graph.apply("neg", found) if op == "asin" else graph.apply("sub", graph.constant(math.pi, "float"), found)
         )
     if of == "cos":
-        found = graph.apply("abs", _rest(graph, operands[0], 2 * math.pi))
+        found = graph.apply("abs", _period_remainder(graph, operands[0], 2 * math.pi))
     elif of == "sin":
-        whole, one = _wholes(graph, operands[0], math.pi), graph.constant(1.0, "float")
+        whole, one = _count_periods(graph, operands[0], math.pi), graph.constant(1.0, "float")
         halves = graph.apply("floor", graph.scale(0.5, whole))
         parity = graph.apply("sub", whole, graph.scale(2.0, halves))
         side = graph.apply("sub", one, graph.scale(2.0, parity))
-        found = graph.apply("mul", side, _rest(graph, operands[0], math.pi))
+        found = graph.apply("mul", side, _period_remainder(graph, operands[0], math.pi))
     else:
         return graph.apply(op, x)
     if (of, op) in (("cos", "acos"), ("sin", "asin")):
@@ -293,12 +295,12 @@ def inverse(graph, x: int, op: str) -> int:
     return graph.apply("sub", graph.constant(math.pi / 2, "float"), found)
 
 
-def _rest(graph, u: int, period: float) -> int:
+def _period_remainder(graph, u: int, period: float) -> int:
     """u less whole periods, from −½ period to ½."""
-    return graph.apply("sub", u, graph.scale(period, _wholes(graph, u, period)))
+    return graph.apply("sub", u, graph.scale(period, _count_periods(graph, u, period)))
 
 
-def _wholes(graph, u: int, period: float) -> int:
+def _count_periods(graph, u: int, period: float) -> int:
     """The number of whole periods in u + ½ period, 0 for u = ±½ period as rounded: u is reduced by 2⁻⁵¹ of itself.
 
     NaN beyond `_MOST_WHOLE_TURNS`, where u does not determine the remainder.
@@ -308,7 +310,7 @@ def _wholes(graph, u: int, period: float) -> int:
     return f("select", f("lt", f("abs", wholes), number(_MOST_WHOLE_TURNS)), number(math.nan), wholes)
 
 
-def _quotient(graph, i: int, depth: int) -> tuple[int, int | None]:
+def _split_quotient(graph, i: int, depth: int) -> tuple[int, int | None]:
     """Numerator and denominator of a number with poles where the denominator changes its sign; else itself and None."""
     op, operands, exponent = graph.nodes[i]
     f, one = graph.apply, graph.constant(1.0, "float")
@@ -318,7 +320,7 @@ def _quotient(graph, i: int, depth: int) -> tuple[int, int | None]:
         op, operands, exponent = "integer_pow", operands[:1], int(graph.value(operands[1]))
     if not depth or op not in ("neg", "add", "sub", "mul", "div", "select", "integer_pow"):
         return i, None
-    parts = [_quotient(graph, x, depth - 1) for x in operands[op == "select" :]]
+    parts = [_split_quotient(graph, x, depth - 1) for x in operands[op == "select" :]]
     divides = op == "div" or (op == "integer_pow" and exponent < 0)
     if all(d is None for _, d in parts) and not (divides and not is_nonnegative(graph, operands[-1])):
         return i, None

@@ -81,12 +81,12 @@ def with_sliding(
     """
     if not slides:
         return Sliding(line, range(len(line.nodes)), [], linear, Holding())
-    if linear is not None and (done := _slide(line, n, first, switches, slides, linear)) is not None:
+    if linear is not None and (done := _build_sliding(line, n, first, switches, slides, linear)) is not None:
         return done
     is_large = len(slides) > MOST_COPIES or len(line.nodes) > LARGEST_COPIED
     if is_large or any(slide.order > 1 or slide.parts for slide in slides):
         return None
-    done = _slide(line, n, first, switches, slides, _solved_system(line.outputs[:n]))
+    done = _build_sliding(line, n, first, switches, slides, _solved_system(line.outputs[:n]))
     return done and done._replace(linear=None)
 
 
@@ -97,7 +97,7 @@ def _solved_system(z: Sequence[int]) -> LinearSystem:
     return LinearSystem(tuple(z), {}, tuple(z), (), lambda: same)
 
 
-def _slide(
+def _build_sliding(
     line: StraightLine, n: int, first: int, switches: Sequence[int], slides: Sequence[Slide], linear: LinearSystem
 ) -> Sliding | None:
     """The program; None where pieces act on more than the right side, or not each for itself."""
@@ -125,7 +125,7 @@ class _SlidingForces:
 
     def build(self) -> Sliding:
         rows, slopes = self.rows, self.slopes
-        responses, effects = self._effects()
+        responses, effects = self._piece_effects()
         pushed = self._find_pushed(effects)
         pivots = choose_pivots([constants(self.graph, d) for d in slopes])
         held = Held(self.graph, rows.n, pushed, slopes, responses, pivots)
@@ -133,27 +133,27 @@ class _SlidingForces:
             # Borders that are not pushed onto are left, and act on nothing until then.
             [{i: self.where(p, c) for i, c in act.items()} for p, act in zip(pushed, self.acts, strict=True)],
             [{i: self.where(p, d) for i, d in of.items()} for p, of in zip(pushed, slopes, strict=True)],
-            self._equations(effects, pushed, slopes),
+            self._share_equations(effects, pushed, slopes),
             held.pivots(),
         )
         ends = list(map(self.where, pushed, self.rates))
         missing = coupled.missing(self.graph, self.linear.z, ends)
-        mu = self._unknown(coupled.equations, missing)
+        mu = self._solve_shares(coupled.equations, missing)
         directions = [self.f("select", p, self.f("neg", x), y) for p, x, y in zip(pushed, missing, mu, strict=True)]
-        z = self._solve(coupled.push(self.graph, self.linear.right, mu))
-        missed = self._miss_constraints(z)
+        z = self._solve_system(coupled.push(self.graph, self.linear.right, mu))
+        missed = self._constraint_residuals(z)
         if len(pivots) < len(self.acts) or missed:
             # What has no pivot, and what constraints tie to one, is held by the rounding of rounding.
-            rest = self._solve([missed.get(i, self.zero) for i in range(len(z))]) if missed else []
+            rest = self._solve_system([missed.get(i, self.zero) for i in range(len(z))]) if missed else []
             z = [self.f("add", *pair) for pair in zip(z, rest, strict=True)] if missed else z
-            z, mu = coupled.mend(self.graph, self._solve, z, mu, ends)
+            z, mu = coupled.mend(self.graph, self._solve_system, z, mu, ends)
         z = held.hold(z, self.rates)
-        shares = [self._share(k, mu, pushed, z, effects) for k in range(len(rows.slides))]
-        linear = self._system(z, mu, coupled, ends)
+        shares = [self._upper_share(k, mu, pushed, z, effects) for k in range(len(rows.slides))]
+        linear = self._share_system(z, mu, coupled, ends)
         outputs = (*z[: rows.n], *self.line.outputs[rows.n :])
         line = StraightLine(tuple(self.graph.nodes), tuple(self.graph.kinds), outputs)
-        release = eliminate_dead_code(self.graph, self._release(directions))
-        retraction, moved = self._retract(held, coupled.equations, effects, pushed, missing)
+        release = eliminate_dead_code(self.graph, self._release_shares(directions))
+        retraction, moved = self._build_retraction(held, coupled.equations, effects, pushed, missing)
         of_slides = tuple(frozenset().union(*some) for some in rows.group(moved))
         groups = tuple(self.groups[rows[0]] for rows in rows.of_slides)
         holding = Holding(retraction, of_slides, groups, release)
@@ -166,14 +166,14 @@ class _SlidingForces:
         every = [functools.reduce(lambda a, b: self.f("and", a, b), of, flag) for flag, of in of_slides]
         return [every[row.slide] for row in self.rows.rows]
 
-    def _retract(self, held: Held, equations: Eliminated, effects, pushed, missing):
+    def _build_retraction(self, held: Held, equations: Eliminated, effects, pushed, missing):
         """The retraction, and the coordinates that each row moves."""
         by_position = [k for k in range(len(pushed)) if self.rows.order(k) > 1]
         if by_position:
             at = {m: i for i, m in enumerate(by_position)}
             some = [{at[m]: x for m, x in effects[k].items() if m in at} for k in by_position]
             pushes = [self._pushes_back(k, effects, pushed, missing) for k in by_position]
-            of_positions = self._equations(some, pushes, [self.slopes[k] for k in by_position])
+            of_positions = self._share_equations(some, pushes, [self.slopes[k] for k in by_position])
             levels = [self.rows.rows[k].offset for k in by_position]
             held.put_back(0, by_position, levels, lambda left: of_positions.solve(self.graph, left), pushes)
         solve = functools.partial(equations.solve, self.graph)
@@ -194,10 +194,10 @@ class _SlidingForces:
             row[size + first] = self.one
         return find_groups(touched, size + len(touched))
 
-    def _dot(self, row: Sparse, xs: Sequence[int]) -> int:
+    def _dot_product(self, row: Sparse, xs: Sequence[int]) -> int:
         return dot(self.graph, row.values(), [xs[i] for i in row])
 
-    def _release(self, directions: Sequence[int]) -> list[int]:
+    def _release_shares(self, directions: Sequence[int]) -> list[int]:
         f, slopes, results = self.f, self.slopes, []
         for k, slide in enumerate(self.rows.slides):
             if not slide.parts:
@@ -209,21 +209,21 @@ class _SlidingForces:
             sizes = [dot(self.graph, slopes[m].values(), slopes[m].values()) for m in rows]
             for numbers in ([f("div", x, length) for x in along], [self.rows.rows[m].offset for m in rows]):
                 parts = [f("div", x, size) for x, size in zip(numbers, sizes, strict=True)]
-                results += [self._dot(of, parts) for of in transpose([slopes[m] for m in rows], self.rows.n)]
+                results += [self._dot_product(of, parts) for of in transpose([slopes[m] for m in rows], self.rows.n)]
         return results
 
     @functools.cached_property
-    def _solution(self) -> StraightLine:
+    def _split_solution(self) -> StraightLine:
         return self.linear.solve()
 
-    def _solve(self, right: Sequence[int]) -> list[int]:
+    def _solve_system(self, right: Sequence[int]) -> list[int]:
         """z of A z = r."""
-        nodes = copy_nodes(self.graph, self._solution, [*self.linear.factors, *right])
-        return [nodes[i] for i in self._solution.outputs]
+        nodes = copy_nodes(self.graph, self._split_solution, [*self.linear.factors, *right])
+        return [nodes[i] for i in self._split_solution.outputs]
 
-    def _respond(self, acts: Sequence[Sparse]) -> list[Sparse]:
+    def _solve_sparse_sides(self, acts: Sequence[Sparse]) -> list[Sparse]:
         """z of A z = r for some r of few entries each: only what depends on these is computed."""
-        line, first, results = self._solution, len(self.linear.factors), []
+        line, first, results = self._split_solution, len(self.linear.factors), []
         still = copy_nodes(self.graph, line, [*self.linear.factors, *[self.zero] * len(self.linear.right)])
         inputs = {node[2]: i for i, node in enumerate(line.nodes) if node[0] == "input"}
         readers, places = find_readers(line.nodes), {}
@@ -238,19 +238,19 @@ class _SlidingForces:
             results.append({i: x for i, x in z if x != self.zero})
         return results
 
-    def _miss_constraints(self, z: Sequence[int]) -> dict[int, int]:
+    def _constraint_residuals(self, z: Sequence[int]) -> dict[int, int]:
         """r − A z in the rows of constraints, whose entries are those of coordinates alone."""
         entries = self.linear.entries
         rows = set(range(self.rows.n, len(z))) - {i for place in entries if min(place) >= self.rows.n for i in place}
         found = {}
         for i in sorted(rows):
             known = {j: c for (k, j), c in entries.items() if k == i}
-            found[i] = self.f("sub", self.linear.right[i], self._dot(known, z))
+            found[i] = self.f("sub", self.linear.right[i], self._dot_product(known, z))
         return found
 
-    def _effects(self) -> tuple[list[Sparse], list[Sparse]]:
+    def _piece_effects(self) -> tuple[list[Sparse], list[Sparse]]:
         """The slopes of z by each piece, and ∂u̇/∂p of each border by each piece."""
-        responses, effects = self._respond(self.acts), []
+        responses, effects = self._solve_sparse_sides(self.acts), []
         of_coordinates = transpose(responses, len(self.linear.right))
         for d in self.slopes:
             row = {}
@@ -260,7 +260,7 @@ class _SlidingForces:
             effects.append({m: x for m, x in row.items() if x != self.zero})
         return responses, effects
 
-    def _equations(self, effects: list[Sparse], pushed: Sequence[int], slopes: Sequence[Sparse]) -> Eliminated:
+    def _share_equations(self, effects: list[Sparse], pushed: Sequence[int], slopes: Sequence[Sparse]) -> Eliminated:
         """The linear equations of μ; μ = 0 where there is nothing to do."""
         f, rows = self.f, []
         for k, row in enumerate(effects):
@@ -280,28 +280,28 @@ class _SlidingForces:
         if all(self.rows.order(k) > 1 for k in others):
             return pushed[j]
         without = [p if k != j else f("and", p, f("not", p)) for k, p in enumerate(pushed)]
-        equations = self._equations(effects, without, self.slopes)
+        equations = self._share_equations(effects, without, self.slopes)
         stays = pushed[j]
         for change in (self.graph.number(2.0), self.zero):
             beside = [
                 f("sub", x, f("mul", effects[k][j], change)) if j in effects[k] else x for k, x in enumerate(missing)
             ]
-            mu = self._unknown(equations, list(map(self.where, without, beside)))
+            mu = self._solve_shares(equations, list(map(self.where, without, beside)))
             for k in others:
                 held = f("lt", f("abs", f("add", mu[k], self.graph.number(self.rows.rows[k].below))), self.one)
                 stays = f("and", stays, f("or", f("not", pushed[k]), held))
-            moves = f("abs", f("sub", beside[j], self._dot(drop_entry(effects[j], j), mu)))
+            moves = f("abs", f("sub", beside[j], self._dot_product(drop_entry(effects[j], j), mu)))
             own = effects[j].get(j, self.zero)
             stays = f("and", stays, f("le", moves, f("mul", self.graph.number(STILL), f("abs", own))))
         return f("and", pushed[j], f("not", stays))
 
-    def _unknown(self, equations: Eliminated, missing: list[int]) -> list[int]:
+    def _solve_shares(self, equations: Eliminated, missing: list[int]) -> list[int]:
         """μ; where borders share what they hold, μ − 1 is to be small: the distance from the middle of both sides."""
         if not equations.whole:
             return equations.solve(self.graph, missing)
         f, rows = self.f, equations.whole
         below = [self.graph.number(row.below) for row in self.rows.rows]
-        there = [f("add", x, self._dot(row, below)) for x, row in zip(missing, rows, strict=True)]
+        there = [f("add", x, self._dot_product(row, below)) for x, row in zip(missing, rows, strict=True)]
         return [f("sub", x, p) for x, p in zip(equations.solve(self.graph, there), below, strict=True)]
 
     def _are_dependent(self, slopes: Sequence[Sparse]) -> bool:
@@ -320,7 +320,7 @@ class _SlidingForces:
                 return True
         return False
 
-    def _share(self, k: int, unknown: Sequence[int], pushed: Sequence[int], z, effects) -> int:
+    def _upper_share(self, k: int, unknown: Sequence[int], pushed: Sequence[int], z, effects) -> int:
         """The share of the upper side: μ/2, and far beyond 0 or 1 where both sides do not push.
 
         Of a cone, which holds up to a length of 1, it is what is left of the square of that, of 1/4: never 1.
@@ -331,12 +331,12 @@ class _SlidingForces:
         if self.rows.slides[k].parts:
             left = f("sub", self.one, dot(self.graph, mu, mu))
             return f("select", pushed[row], self.graph.number(-FAR), f("mul", self.graph.number(0.25), left))
-        moves, own = f("sub", self._dot(self.slopes[row], z), self.rates[row]), effects[row].get(row, self.zero)
+        moves, own = f("sub", self._dot_product(self.slopes[row], z), self.rates[row]), effects[row].get(row, self.zero)
         moves = f("select", f("eq", moves, self.zero), moves, own)  # at rest below, the side above alone moves
         beyond = f("select", self.rows.flags[k], half, f("add", half, f("mul", self.graph.number(FAR), moves)))
         return f("select", pushed[row], beyond, f("mul", half, mu[0]))
 
-    def _system(self, z: list[int], mu: list[int], coupled: Coupled, ends: list[int]) -> LinearSystem:
+    def _share_system(self, z: list[int], mu: list[int], coupled: Coupled, ends: list[int]) -> LinearSystem:
         system, count, graph = self.linear, len(self.linear.right), self.graph
         others = {(i, count + k): self.f("neg", c) for k, act in enumerate(coupled.acts) for i, c in act.items()}
         entries = ((k, i, d) for k, of_one in enumerate(coupled.normals) for i, d in of_one.items())

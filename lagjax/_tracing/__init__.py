@@ -192,7 +192,7 @@ class Program:
         """The outputs, one per scalar; see the module's text for lanes and precision."""
         if len(scalars) != self.size:
             raise TypeError(f"this program takes {self.size} scalars, not {len(scalars)}")
-        return self._differentiable(*scalars)
+        return self._differentiable_call(*scalars)
 
     def vector(self, *scalars) -> Scalars:
         """The outputs as one vector, in a formula of `Scalars`, of whose graph the program becomes part."""
@@ -281,7 +281,7 @@ class Program:
     # ---- derivatives ----
 
     @functools.cached_property
-    def _differentiable(self) -> Callable:
+    def _differentiable_call(self) -> Callable:
         def run(*scalars):
             return emit(self.line, scalars)
 

@@ -44,7 +44,7 @@ def _emit_outputs(line: StraightLine, scalars, shape: tuple[Any, ...], entries: 
                 turns[operands[0]] = _sincos(values[operands[0]])
             values[i] = turns[operands[0]][op == "cos"]
         else:
-            values[i] = _apply(op, _align_shapes([values[operand] for operand in operands]), attribute)
+            values[i] = _apply_operation(op, _align_shapes([values[operand] for operand in operands]), attribute)
     return tuple(jnp.broadcast_to(jnp.asarray(values[i]), shape) for i in line.outputs)
 
 
@@ -90,16 +90,16 @@ def emit_look_up(op: str, attribute, entries: Callable, precision, x) -> jax.Arr
     return jnp.vectorize(piece, signature="(k),()->()")(values, x)
 
 
-def _binade(x):
+def _power_of_two(x):
     one = jnp.ones_like(x)
     power = jnp.where(x == 0, one, jnp.ldexp(one, jnp.frexp(lax.stop_gradient(x))[1] - 1))
     return jnp.where(jnp.isfinite(x), power, jnp.abs(x))
 
 
-WRITTEN: dict[str, Callable] = {"binade": _binade, "trunc": jnp.trunc}  # operations that `lax` does not have
+WRITTEN: dict[str, Callable] = {"binade": _power_of_two, "trunc": jnp.trunc}  # operations that `lax` does not have
 
 
-def _apply(op: str, xs: list, attribute) -> jax.Array:
+def _apply_operation(op: str, xs: list, attribute) -> jax.Array:
     function = WRITTEN.get(op) or getattr(lax, OPERATIONS[op].lax or op)
     return function(*xs) if attribute is None else function(*xs, lax.RoundingMethod(attribute))
 
@@ -107,7 +107,7 @@ def _apply(op: str, xs: list, attribute) -> jax.Array:
 def apply_in_jax(op: str, *xs, attribute=None) -> jax.Array:
     """The operation on arrays that broadcast: `f` of the formulas of `_operations`, in JAX."""
     dtype = jnp.result_type(*xs)
-    return _apply(op, _align_shapes([jnp.asarray(x, dtype) for x in xs]), attribute)
+    return _apply_operation(op, _align_shapes([jnp.asarray(x, dtype) for x in xs]), attribute)
 
 
 @jax.custom_jvp

@@ -54,12 +54,12 @@ class Scalars:
     __eq__, __or__ = partialmethod(_forward, "eq"), partialmethod(_forward, "or")  # type: ignore[assignment]
 
 
-def _first(xs: Sequence) -> Scalars:
+def _first_scalars(xs: Sequence) -> Scalars:
     return next(x for x in xs if isinstance(x, Scalars))
 
 
 def _function(op: str) -> Callable[..., Scalars]:
-    return lambda *xs: _first(xs).map(op, *xs)
+    return lambda *xs: _first_scalars(xs).map(op, *xs)
 
 
 binade, prefers, logarithm, root, maximum, absolute = map(_function, ("binade", "prefers", "log", "sqrt", "max", "abs"))
@@ -67,7 +67,7 @@ binade, prefers, logarithm, root, maximum, absolute = map(_function, ("binade", 
 
 def where(condition, yes, no) -> Scalars:
     """`yes` where the condition holds, else `no`."""
-    return _first((condition, yes, no)).map("select", condition, no, yes)
+    return _first_scalars((condition, yes, no)).map("select", condition, no, yes)
 
 
 def fold(op: str, x: Scalars) -> Scalars:
@@ -77,7 +77,7 @@ def fold(op: str, x: Scalars) -> Scalars:
 
 
 def concatenate(parts: Sequence) -> Scalars:
-    first = _first(parts)
+    first = _first_scalars(parts)
     return Scalars(first.expansion, np.concatenate([first._ids(part) for part in parts]))
 
 
@@ -111,7 +111,7 @@ def multiply(a: Sequence[Scalars], b: Sequence[Scalars]) -> Scalars:
 
 def stack(parts: Sequence) -> Scalars:
     """Scalars as a vector, or vectors as the rows of a matrix."""
-    first = _first(parts)
+    first = _first_scalars(parts)
     return Scalars(first.expansion, np.stack([first._ids(x) for x in parts]))
 
 

@@ -60,7 +60,7 @@ class Edition:
         now = self.now()
         if now is not self and now != self:
             raise ValueError(
-                f"{_difference(self, now)} Derive the result again with the new value, or set the former one back; "
+                f"{_name_change(self, now)} Derive the result again with the new value, or set the former one back; "
                 "values that change often belong into `params`."
             )
 
@@ -84,7 +84,7 @@ class Edition:
         """The function by name; one that has none, such as a lambda, by value, as cloudpickle packs it."""
         try:
             pickle.dumps(self.function)
-            return _edition_of, (self.function,)
+            return _pickled_edition, (self.function,)
         except (pickle.PicklingError, AttributeError, TypeError) as reason:
             try:
                 import cloudpickle
@@ -93,7 +93,7 @@ class Edition:
                     f"{self.function!r} has no name by which another process could find it: define it with def at the "
                     "top of a module, or pip install cloudpickle."
                 ) from reason
-            return _edition_from, (cloudpickle.dumps(self.function),)
+            return _rebuild_edition, (cloudpickle.dumps(self.function),)
 
     @contextlib.contextmanager
     def traced(self) -> Iterator[None]:
@@ -114,12 +114,12 @@ class Edition:
                 self._watch.settle()
 
 
-def _edition_of(function: Callable) -> Edition:
+def _pickled_edition(function: Callable) -> Edition:
     """The function that a pickle calls: cloudpickle would take the class with all that it reads for a method of it."""
     return Edition.from_function(function)
 
 
-def _edition_from(packed: bytes) -> Edition:
+def _rebuild_edition(packed: bytes) -> Edition:
     return Edition.from_function(pickle.loads(packed))
 
 
@@ -141,7 +141,7 @@ class _Watch:
         if latest is not None and latest[0].hold():
             return latest[1]
         walk, text = self._walk()
-        if latest is not None and all(map(_own.__contains__, _new_places(latest[0], walk))):
+        if latest is not None and all(map(_own.__contains__, _changed_places(latest[0], walk))):
             edition = latest[1]
         else:
             edition = Edition(self.function, text, walk.held, walk.tracers, len(walk.things) > 1, self)
@@ -164,13 +164,13 @@ class _Watch:
         if latest is None or latest[0].hold():
             return
         walk, _ = self._walk()
-        _own.update({key: x for key, x in _new_places(latest[0], walk).items() if walk.is_own(x, key[1])})
+        _own.update({key: x for key, x in _changed_places(latest[0], walk).items() if walk.is_own(x, key[1])})
         for key in list(_own)[:-_MOST_OWN]:
             _own.pop(key, None)
         self.edition()
 
 
-def _new_places(before: Marks, now: "_LiveWalk") -> dict[tuple[int, str | None], Any]:
+def _changed_places(before: Marks, now: "_LiveWalk") -> dict[tuple[int, str | None], Any]:
     """The place that has another value now than before."""
     keys = before.keys
     new = {key: place for key, place in now.marks.keys.items() if key not in keys}
@@ -220,7 +220,7 @@ class _LiveWalk(Walk):
             return self.hold(array)
 
 
-def _difference(old: Edition, now: Edition) -> str:
+def _name_change(old: Edition, now: Edition) -> str:
     name = getattr(old.function, "__name__", type(old.function).__name__)
     pairs = zip(old.text.split("\n"), now.text.split("\n"), strict=False)
     was, is_now = next(((a.strip(), b.strip()) for a, b in pairs if a != b), ("another value", "this one"))

@@ -138,9 +138,9 @@ class Walk:
             return self._parts("partial", [("of", thing.func), ("args", thing.args), ("keywords", thing.keywords)])
         if isinstance(thing, property):
             return self._parts("property", [("get", thing.fget)])
-        if (inner := _unwrap(thing)) is not None:
+        if (inner := _unwrap_function(thing)) is not None:
             return self._parts("wrapped", [("function", inner), *self._function_attributes(thing)])
-        return self._parts(self.name(type(thing)), self._state(thing))
+        return self._parts(self.name(type(thing)), self._attribute_values(thing))
 
     def _parts(self, kind: str, parts) -> str:
         return "\n".join([kind, *(f"    {name} = {self.name(value)}" for name, value in parts)])
@@ -148,7 +148,7 @@ class Walk:
     def _function_parts(self, function: types.FunctionType) -> Iterator[tuple[str, Any]]:
         """The byte code, the defaults and the outer values of a function; of a library's function its closure alone."""
         cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
-        inside = {name: self.read(cell, name, cell.cell_contents) for name, cell in cells if _is_filled(cell)}
+        inside = {name: self.read(cell, name, cell.cell_contents) for name, cell in cells if _is_cell_filled(cell)}
         if not _is_users(function.__module__):
             yield "name", f"{function.__module__}.{function.__qualname__}"
             yield "code", code_text(function.__code__)  # functions made by one function have one name
@@ -193,10 +193,10 @@ class Walk:
             # A method of a module of equinox is wrapped.
             place = "__func__" if isinstance(value, staticmethod | classmethod) else "method"
             inner: Any = getattr(value, place, value)
-            if _is_said_by_class(name, inner) and self.wants(name, inner, kind):
+            if _is_class_boilerplate(name, inner) and self.wants(name, inner, kind):
                 yield name, CHANGING if self.read(kind, name, value) is CHANGING else inner
 
-    def _state(self, thing: Any) -> list[tuple[str, Any]]:
+    def _attribute_values(self, thing: Any) -> list[tuple[str, Any]]:
         """The attributes of an object by name; of what converts to an array, its values."""
         inside, users = getattr(thing, "__dict__", {}), _is_users(type(thing).__module__)
         try:
@@ -216,16 +216,16 @@ class Walk:
             if users:
                 held = {name: x for name, x in held.items() if self.wants(name, x, thing)}
             else:  # not its caches, unless there is nothing else, as in what delegates to another object
-                held = {name: x for name, x in held.items() if not name.startswith("_") or _is_plain(x)} or held
+                held = {name: x for name, x in held.items() if not name.startswith("_") or _is_plain_value(x)} or held
         held = {name: self.read(inside if name in inside else thing, name, x) for name, x in held.items()}
         if not held and not users:
-            return self._opaque(thing)
+            return self._describe_opaque(thing)
         self.read(inside, SIZE, None)
         if not users:
             self.of_libraries.add(id(inside))
         return sorted(held.items())
 
-    def _opaque(self, thing: Any) -> list[tuple[str, Any]]:
+    def _describe_opaque(self, thing: Any) -> list[tuple[str, Any]]:
         """The words for an object whose inside cannot be seen; it is `held` where they do not tell it from others."""
         try:
             shown = repr(thing)
@@ -245,7 +245,7 @@ def place_in(things: list, thing: Any) -> int:
     return len(things) - 1
 
 
-def _is_filled(cell: types.CellType) -> bool:
+def _is_cell_filled(cell: types.CellType) -> bool:
     try:
         return cell.cell_contents is cell.cell_contents
     except ValueError:  # of a name that is assigned later
@@ -253,14 +253,14 @@ def _is_filled(cell: types.CellType) -> bool:
 
 
 # Attributes of every class, which say nothing that its code does not: methods of that kind enter, values do not.
-def _is_said_by_class(name: str, value: Any) -> bool:
+def _is_class_boilerplate(name: str, value: Any) -> bool:
     is_dunder = name.startswith("__") and name.endswith("__")
     if is_dunder:
         return isinstance(value, types.FunctionType | property)
     return not isinstance(value, types.MemberDescriptorType | types.GetSetDescriptorType) and name != "_abc_impl"
 
 
-def _is_plain(value: Any) -> bool:
+def _is_plain_value(value: Any) -> bool:
     return isinstance(value, int | float | complex | str | np.ndarray | jax.Array)
 
 
@@ -273,7 +273,7 @@ def _import_module(names: dict[str, Any], level: int, name: str) -> types.Module
         return None
 
 
-def _unwrap(thing: Any) -> Any:
+def _unwrap_function(thing: Any) -> Any:
     """The function within one that `functools.wraps` or `jax.jit` made; None of others."""
     # What jax.jit returns has no `__wrapped__` any more once it came from another process.
     state = thing.__getstate__() if type(thing).__name__ == "PjitFunction" else {}
@@ -287,7 +287,7 @@ def _library_name(value: Any) -> str | None:
         return None
     if isinstance(value, types.FunctionType) and (value.__closure__ or "<" in name):
         return None
-    compiled = not isinstance(value, type | types.FunctionType | types.MethodType) and _unwrap(value) is None
+    compiled = not isinstance(value, type | types.FunctionType | types.MethodType) and _unwrap_function(value) is None
     return f"{module}.{name}" if compiled or not _is_users(module) else None
 
 

@@ -32,7 +32,7 @@ class Marks:
         if key is SIZE:
             self._contents.append((len, place, SIZE, len(place), None))
         elif key is not None:
-            self._values.append((_reader(place), place, key, value))
+            self._values.append((_key_reader(place), place, key, value))
         elif not isinstance(place, tuple | frozenset):
             content, parts = _content_reader(place)
             self._contents.append((content, place, None, content(place), parts))
@@ -61,7 +61,7 @@ class Marks:
             yield None, None
 
 
-def _reader(place: Any) -> Callable[[str, Any], Any]:
+def _key_reader(place: Any) -> Callable[[str, Any], Any]:
     """A function of a key and of what to return if nothing is under it: a method written in C, where there is one."""
     if isinstance(place, types.CellType):
         return lambda key, default: place.cell_contents

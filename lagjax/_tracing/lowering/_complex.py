@@ -63,12 +63,12 @@ class Pair(NamedTuple):
         return Pair(self.im, -self.re)
 
 
-def _f(op: str, x: Scalars, *others) -> Scalars:
+def _real(op: str, x: Scalars, *others) -> Scalars:
     return x.map(op, x, *others)
 
 
 def _polar(size: Scalars, angle: Scalars) -> Pair:
-    return Pair(size * _f("cos", angle), size * _f("sin", angle))
+    return Pair(size * _real("cos", angle), size * _real("sin", angle))
 
 
 # ---- functions ------------------------------------------------------------------------------------------------------
@@ -94,13 +94,13 @@ def _absolute(z: Pair) -> Scalars:
 def _sign(z: Pair) -> Pair:
     """z/|z|, and 0 at 0."""
     square = z.square
-    is_zero = _f("eq", square, 0.0)
-    size = _f("sqrt", is_zero.map("select", is_zero, square, 1.0))
+    is_zero = _real("eq", square, 0.0)
+    size = _real("sqrt", is_zero.map("select", is_zero, square, 1.0))
     return Pair(z.re / size, z.im / size)
 
 
 def _square_root(z: Pair) -> Pair:
-    return _polar(_f("sqrt", _f("sqrt", z.square)), 0.5 * z.angle)
+    return _polar(_real("sqrt", _real("sqrt", z.square)), 0.5 * z.angle)
 
 
 def _whole_power(z: Pair, exponent: int) -> Pair:
@@ -124,28 +124,28 @@ def _power(z: Pair, exponent: Pair) -> Pair:
     if value is not None and value == round(value) and abs(value) <= 16:
         return _whole_power(z, int(value))
     if value is not None and value > 1:  # has a derivative at zero, which its parts have not
-        is_zero = _f("eq", z.square, 0.0)
+        is_zero = _real("eq", z.square, 0.0)
         beside = Pair(is_zero.map("select", is_zero, z.re, 1.0), z.im)
-        parts = _polar(_f("pow", beside.square, 0.5 * value), value * beside.angle)
+        parts = _polar(_real("pow", beside.square, 0.5 * value), value * beside.angle)
         return Pair(*(is_zero.map("select", is_zero, x, 0.0) for x in parts))
-    size = _f("pow", z.square, 0.5 * exponent.re)
+    size = _real("pow", z.square, 0.5 * exponent.re)
     if exponent.is_real:
         return _polar(size, z.angle * exponent.re)
-    size = size * _f("exp", -(exponent.im * z.angle))
-    return _polar(size, exponent.re * z.angle + exponent.im * (0.5 * _f("log", z.square)))
+    size = size * _real("exp", -(exponent.im * z.angle))
+    return _polar(size, exponent.re * z.angle + exponent.im * (0.5 * _real("log", z.square)))
 
 
 def _sine(z: Pair) -> Pair:
-    return Pair(_f("sin", z.re) * _f("cosh", z.im), _f("cos", z.re) * _f("sinh", z.im))
+    return Pair(_real("sin", z.re) * _real("cosh", z.im), _real("cos", z.re) * _real("sinh", z.im))
 
 
 def _cosine(z: Pair) -> Pair:
-    return Pair(_f("cos", z.re) * _f("cosh", z.im), -(_f("sin", z.re) * _f("sinh", z.im)))
+    return Pair(_real("cos", z.re) * _real("cosh", z.im), -(_real("sin", z.re) * _real("sinh", z.im)))
 
 
 def _tangent(z: Pair) -> Pair:
     """tan x sech² y/(1 + tan² x tanh² y) and tanh y sec² x/(1 + …), written so that nothing overflows."""
-    sine, cosine, ratio = _f("sin", z.re), _f("cos", z.re), _f("tanh", z.im)
+    sine, cosine, ratio = _real("sin", z.re), _real("cos", z.re), _real("tanh", z.im)
     size = cosine * cosine + sine * sine * ratio * ratio
     return Pair(sine * cosine * (1.0 - ratio * ratio) / size, ratio / size)
 
@@ -168,16 +168,16 @@ _FUNCTIONS: dict[str, Callable] = {
     "pow": _power,
     "sqrt": _square_root,
     "rsqrt": lambda z: _inverse(_square_root(z)),
-    "exp": lambda z: _polar(_f("exp", z.re), z.im),
-    "log": lambda z: Pair(0.5 * _f("log", z.square), z.angle),
+    "exp": lambda z: _polar(_real("exp", z.re), z.im),
+    "log": lambda z: Pair(0.5 * _real("log", z.square), z.angle),
     "sin": _sine,
     "cos": _cosine,
     "tan": _tangent,
     "sinh": _derive_circular(_sine),
     "cosh": lambda z: _cosine(z.multiply_by_i),
     "tanh": _derive_circular(_tangent),
-    "eq": lambda a, b: _f("and", _f("eq", a.re, b.re), _f("eq", a.im, b.im)),
-    "ne": lambda a, b: _f("or", _f("ne", a.re, b.re), _f("ne", a.im, b.im)),
+    "eq": lambda a, b: _real("and", _real("eq", a.re, b.re), _real("eq", a.im, b.im)),
+    "ne": lambda a, b: _real("or", _real("ne", a.re, b.re), _real("ne", a.im, b.im)),
 }
 # What is linear, or moves numbers by others: done with each part.
 _PARTWISE = (

@@ -28,7 +28,7 @@ def are_numbers(expansion: Any, ids: Ids) -> bool:
 
 def locate_knots(expansion: Any, knots: Ids, x: Ids, closed: bool) -> Ids | None:
     """The number of increasing `knots` at most x, less one (`_look_ups.Located`); None where they are no table."""
-    table = _table(expansion, knots) if knots.size else None
+    table = _table_of_array(expansion, knots) if knots.size else None
     if table is None or table.stride < 0:
         return None
     attribute = Located(table, closed)
@@ -60,7 +60,7 @@ def look_up_windows(expansion: Any, x: Ids, indices: Ids, axes: Any, sizes: Any,
     axes, flat = list(axes), x.ravel()
     room = [x.shape[axis] - sizes[axis] for axis in axes]
     strides = [math.prod(x.shape[axis + 1 :]) for axis in axes]
-    place, inside = _place(expansion, indices, room, strides)
+    place, inside = _window_place(expansion, indices, room, strides)
     window = np.arange(x.size).reshape(x.shape)[tuple(slice(0, size) for size in sizes)]
     last = room[0] if len(axes) == 1 else sum(top * stride for top, stride in zip(room, strides, strict=True))
     stride = strides[0] if len(axes) == 1 else 1
@@ -68,7 +68,7 @@ def look_up_windows(expansion: Any, x: Ids, indices: Ids, axes: Any, sizes: Any,
     for of in np.ndindex(*window.shape):
         entries = flat[int(window[of]) + stride * np.arange(last + 1)]
         for at in np.ndindex(*place.shape):
-            result[(*at, *of)] = _entry(expansion, entries, int(place[at]))
+            result[(*at, *of)] = _array_entry(expansion, entries, int(place[at]))
     if missing is None:
         return result
     inside = inside.reshape(*place.shape, *[1] * window.ndim)
@@ -81,23 +81,23 @@ def kind_of_ids(graph: Graph, x: Ids) -> str:
     return graph.kinds[x.flat[0]] if x.size and x.flat[0] < INPUTS else "float"
 
 
-def _entry(expansion: Any, ids: Ids, place: int) -> int:
+def _array_entry(expansion: Any, ids: Ids, place: int) -> int:
     """The entry of this number, a float that is whole; the nearest where there is none."""
     graph = expansion.graph
-    if (table := _table(expansion, ids)) is not None:
+    if (table := _table_of_array(expansion, ids)) is not None:
         entry, kind = graph.apply("take", place, attribute=table), kind_of_ids(graph, ids)
         if kind == "bool":
             return graph.apply("ne", entry, graph.number(0.0))
         return entry if kind == "float" else graph.apply("convert", entry, attribute=kind)
-    if (parts := _combination(graph, ids)) is not None:
+    if (parts := _common_combination(graph, ids)) is not None:
         total = graph.number(0.0)
         for base, numbers in parts.items():
             factor = graph.apply("take", place, attribute=Table(0, 1, ids.size, numbers.tobytes()))
             total = graph.apply("add", total, graph.apply("mul", factor, base))
         return total
-    if (columns := _operands(graph, ids)) is not None:
+    if (columns := _common_operands(graph, ids)) is not None:
         op, _, attribute = graph.nodes[ids[0]]
-        operands = [int(of[0]) if (of == of[0]).all() else _entry(expansion, of, place) for of in columns]
+        operands = [int(of[0]) if (of == of[0]).all() else _array_entry(expansion, of, place) for of in columns]
         return graph.apply(op, *operands, attribute=attribute)
     if ids.size > LARGEST_CHOICE:
         raise Unlowerable(
@@ -113,7 +113,7 @@ def _entry(expansion: Any, ids: Ids, place: int) -> int:
     return found
 
 
-def _combination(graph: Graph, ids: Ids) -> dict[int, np.ndarray] | None:
+def _common_combination(graph: Graph, ids: Ids) -> dict[int, np.ndarray] | None:
     """The coefficients by base where all scalars are combinations of the same few others, as of a times a table."""
     if ids.max() >= INPUTS or any(graph.kinds[i] != "float" for i in ids.tolist()):
         return None
@@ -127,7 +127,7 @@ def _combination(graph: Graph, ids: Ids) -> dict[int, np.ndarray] | None:
     return {base: np.array([of.get(base, 0.0) for of in terms]) for base in bases}
 
 
-def _operands(graph: Graph, ids: Ids) -> list[Ids] | None:
+def _common_operands(graph: Graph, ids: Ids) -> list[Ids] | None:
     """The operands of scalars that are all computed by one operation, each as an array; None of any others."""
     if ids.max() >= INPUTS:
         return None
@@ -146,7 +146,7 @@ def _operands(graph: Graph, ids: Ids) -> list[Ids] | None:
     return list(columns)
 
 
-def _place(expansion: Any, indices: Ids, room: list[int], strides: list[int]) -> tuple[Ids, Ids]:
+def _window_place(expansion: Any, indices: Ids, room: list[int], strides: list[int]) -> tuple[Ids, Ids]:
     """The beginnings of windows, as floats: one index as it is, of several their place in the array; and which fit."""
     f, number, place, inside = expansion.map, expansion.constants, None, None
     for k, (top, stride) in enumerate(zip(room, strides, strict=True)):
@@ -194,7 +194,7 @@ def _compare_floats(graph: Graph, i: int) -> int:
     return i
 
 
-def _table(expansion: Any, x: Ids) -> Table | None:
+def _table_of_array(expansion: Any, x: Ids) -> Table | None:
     """The table whose entries are those of an array, in C order; None where there is none, or its entries move."""
     table = _table_of_ids(expansion.graph, x.ravel())
     return (

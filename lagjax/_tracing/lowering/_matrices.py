@@ -168,7 +168,7 @@ def _linear_solve(expansion, params, *arguments):
     matrix = _matrix_of(expansion, params["jaxprs"].matvec, arguments[:count])
     b = np.concatenate([x.ravel() for x in right])
     x, alike = np.empty_like(b), {}
-    for rows, columns in _blocks(expansion, matrix):
+    for rows, columns in _diagonal_blocks(expansion, matrix):
         _require_small("a linear system", len(rows))
         alike.setdefault((matrix[np.ix_(rows, columns)].tobytes(), len(rows)), []).append((rows, columns))
     for blocks in alike.values():
@@ -200,7 +200,7 @@ def _matrix_of(expansion: Expansion, matvec, constants) -> np.ndarray:
     return np.array([nodes[i] for i in line.outputs], dtype=np.int64).reshape(entries.shape)
 
 
-def _blocks(expansion: Expansion, matrix: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def _diagonal_blocks(expansion: Expansion, matrix: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """The rows and columns of the parts of a matrix that its zeros keep apart; the whole where one is not square."""
     n, values = len(matrix), [expansion.graph.value(i) for i in matrix.ravel().tolist()]
     links = np.zeros((2 * n, 2 * n), bool)  # of rows with columns
@@ -230,7 +230,7 @@ LOWER["det"] = lambda of, params, a: _map_matrices("a determinant", lambda a: [d
 
 
 @lowers("lu")
-def _lu(expansion, params, a):
+def _lower_lu(expansion, params, a):
     raise Unlowerable(
         "`lu` chooses rows by comparing numbers; `jnp.linalg.solve`, `inv`, `det` and `slogdet` are written out as "
         "scalars without a choice"
@@ -238,7 +238,7 @@ def _lu(expansion, params, a):
 
 
 @lowers("lagjax_solve")
-def _solve(expansion, params, a, b):
+def _solve_matrix(expansion, params, a, b):
     shapes = (jax.ShapeDtypeStruct(x.shape, float) for x in (a, b))
     return expansion.run_closed(jax.make_jaxpr(solve_composed)(*shapes), (a, b))
 

@@ -62,7 +62,7 @@ class Expansion:
         if not array.size or array.max() < INPUTS:
             return array
         self.work(array.size)
-        return _ids([i if i >= PAIRS else self.graph.real(i) for i in array.ravel().tolist()], array.shape)
+        return _scalar_ids([i if i >= PAIRS else self.graph.real(i) for i in array.ravel().tolist()], array.shape)
 
     def constants(self, value) -> np.ndarray:
         if isinstance(value, Tracer):
@@ -74,7 +74,7 @@ class Expansion:
         if kind == "float" and value.size > LARGEST_UNFOLDED:
             return self.graph.array(value)
         self.work(value.size)
-        return _ids([self.graph.constant(x, kind) for x in value.ravel().tolist()], value.shape)
+        return _scalar_ids([self.graph.constant(x, kind) for x in value.ravel().tolist()], value.shape)
 
     def pair(self, re: np.ndarray, im: np.ndarray) -> np.ndarray:
         first = PAIRS + len(self._pairs)
@@ -87,7 +87,7 @@ class Expansion:
         zero = self.graph.constant(0.0, "float")
         ids = self.real(array).ravel().tolist()
         pairs = [self._pairs[i - PAIRS] if i >= PAIRS else (i, zero) for i in ids]
-        return _ids([re for re, _ in pairs], array.shape), _ids([im for _, im in pairs], array.shape)
+        return _scalar_ids([re for re, _ in pairs], array.shape), _scalar_ids([im for _, im in pairs], array.shape)
 
     @staticmethod
     def has_pairs(array: np.ndarray) -> bool:
@@ -102,7 +102,7 @@ class Expansion:
         self.work(arrays[0].size)
         self.traced_operations += arrays[0].size
         columns = zip(*(array.ravel().tolist() for array in arrays), strict=True)
-        return _ids([function(*of) for of in columns], arrays[0].shape)
+        return _scalar_ids([function(*of) for of in columns], arrays[0].shape)
 
     def fold(self, op: str, array: np.ndarray) -> np.ndarray:
         """`op` along the first axis, from the left."""
@@ -175,12 +175,12 @@ def inputs_of(graph: Graph, shapes) -> list[np.ndarray]:
         if kind == "float" and (many or shape.size > LARGEST_UNFOLDED):
             arguments.append((np.array(places, dtype=np.int64) + INPUTS).reshape(shape.shape))
         else:
-            arguments.append(_ids([graph.input(k, kind) for k in places], shape.shape))
+            arguments.append(_scalar_ids([graph.input(k, kind) for k in places], shape.shape))
         count += shape.size
     return arguments
 
 
-def _ids(ids: list[int], shape) -> np.ndarray:
+def _scalar_ids(ids: list[int], shape) -> np.ndarray:
     return np.array(ids, dtype=np.int64).reshape(shape)
 
 
@@ -210,7 +210,7 @@ def formula_of(equation) -> str | None:
     if name in ("jit", "pjit"):
         called, floats = equation.params["name"], [jnp.issubdtype(x.dtype, jnp.floating) for x in operands]
         suits = called in _FORMULAS and len(floats) == _FORMULAS[called] and (all if called == "hypot" else any)(floats)
-        return called if suits and _find_own(called, equation.params["jaxpr"]) is not None else None
+        return called if suits and _match_library_call(called, equation.params["jaxpr"]) is not None else None
     if name != "custom_jvp_call" or len(operands) != 1:
         return None
     shape, dtype = operands[0].shape, operands[0].dtype
@@ -225,22 +225,22 @@ _WORK_OF_EXCHANGE = 20  # of two numbers of a sort, each in arrays of its own
 _FORMULAS = {"remainder": 2, "floor_divide": 2, "divmod": 2, "trunc": 1, "signbit": 1, "hypot": 2}
 
 
-def _find_own(called: str, body: core.ClosedJaxpr, options: Sequence[dict] = ({},)) -> dict | None:
+def _match_library_call(called: str, body: core.ClosedJaxpr, options: Sequence[dict] = ({},)) -> dict | None:
     """The options with which a function of JAX has this body, if the call that is named like it is that; or None.
 
     Its text tells, or, as that is another one under `vmap`, the scalars that are made of both.
     """
     operands = [(x.shape, x.dtype, x.weak_type) for x in body.in_avals]
-    bodies = [lambda of=of: _body_of(called, *operands, **of) for of in options]
+    bodies = [lambda of=of: _function_body(called, *operands, **of) for of in options]
     text = str(body)
-    for is_own in (lambda own: str(own) == text, lambda own: own is not None and _make_the_same(own, body)):
+    for is_own in (lambda own: str(own) == text, lambda own: own is not None and _check_same_body(own, body)):
         for of, own in zip(options, bodies, strict=True):
             if is_own(own()):
                 return of
     return None
 
 
-def _make_the_same(*bodies: core.ClosedJaxpr) -> bool:
+def _check_same_body(*bodies: core.ClosedJaxpr) -> bool:
     trial = Expansion(Graph(100_000))
     try:
         given = inputs_of(trial.graph, bodies[0].in_avals)
@@ -251,7 +251,7 @@ def _make_the_same(*bodies: core.ClosedJaxpr) -> bool:
 
 
 @functools.cache
-def _body_of(called: str, *operands, **options) -> core.ClosedJaxpr | None:
+def _function_body(called: str, *operands, **options) -> core.ClosedJaxpr | None:
     """The body of a function of JAX, of operands of these shapes and types."""
     given = [jax.ShapeDtypeStruct(shape, dtype, weak_type=weak) for shape, dtype, weak in operands]
     equations = jax.make_jaxpr(functools.partial(getattr(jnp, called), **options))(*given).eqns
@@ -413,7 +413,7 @@ def _powers_of_two(expansion, x, places):
     pairs = [(2**k, expansion.graph.kinds[i]) for k, i in zip(places.ravel().tolist(), x.ravel().tolist(), strict=True)]
     if not all(1 <= power <= np.iinfo(kind).max for power, kind in pairs):
         raise Unlowerable("a number is shifted by more places than it has, or by fewer than none")
-    return _ids([expansion.graph.constant(*pair) for pair in pairs], x.shape)
+    return _scalar_ids([expansion.graph.constant(*pair) for pair in pairs], x.shape)
 
 
 def _shift_right(expansion, params, x, places):
@@ -466,7 +466,7 @@ def _convert_element_type(expansion, params, x):
     x = expansion.real(x)
     if kind == "bool":
         zeros = [expansion.graph.constant(0, expansion.graph.kinds[i]) for i in x.ravel().tolist()]
-        return expansion.map("ne", x, _ids(zeros, x.shape))
+        return expansion.map("ne", x, _scalar_ids(zeros, x.shape))
     return expansion.map("convert", x, attribute=kind)
 
 
@@ -494,7 +494,7 @@ def _choose(expansion, which, cases):
     result = cases[0]
     for k, case in enumerate(cases[1:], 1):
         bound = [expansion.graph.constant(k, expansion.graph.kinds[i]) for i in which.ravel().tolist()]
-        result = expansion.map("select", expansion.map("ge", which, _ids(bound, which.shape)), result, case)
+        result = expansion.map("select", expansion.map("ge", which, _scalar_ids(bound, which.shape)), result, case)
     return result
 
 
@@ -628,7 +628,7 @@ def _dynamic_update_slice(expansion, params, x, update, *starts):
     return result
 
 
-def _places(indices, shape, offset_dims, collapsed, index_map, operand_batch, indices_batch, sizes, clip):
+def _gather_places(indices, shape, offset_dims, collapsed, index_map, operand_batch, indices_batch, sizes, clip):
     """The place of each element of a gather's result in the flattened operand; -1 for a window that sticks out.
 
     The same for a scatter, with the updates in place of the result.
@@ -679,7 +679,7 @@ def _gather(expansion, params, x, indices):
         found = np.squeeze(found, tuple(indices.ndim - 1 + axis for axis in d.collapsed_slice_dims))
         return np.moveaxis(found, range(indices.ndim - 1, found.ndim), d.offset_dims)
     indices = expansion.require_numbers(indices, "an index")
-    places = _places(
+    places = _gather_places(
         indices, x.shape, d.offset_dims, d.collapsed_slice_dims, d.start_index_map, d.operand_batching_dims,
         d.start_indices_batching_dims, params["slice_sizes"], clips,
     )  # fmt: skip
@@ -694,7 +694,7 @@ def _scatter(op):
         window = iter(updates.shape[axis] for axis in d.update_window_dims)
         fixed = (*d.inserted_window_dims, *d.operand_batching_dims)
         sizes = [1 if axis in fixed else next(window) for axis in range(x.ndim)]
-        places = _places(
+        places = _gather_places(
             indices, x.shape, d.update_window_dims, d.inserted_window_dims, d.scatter_dims_to_operand_dims,
             d.operand_batching_dims, d.scatter_indices_batching_dims, sizes, _clips(params["mode"]),
         )  # fmt: skip
@@ -740,7 +740,7 @@ def _side_of_search(body, arguments) -> Literal["right", "left"] | None:
     if not all(jnp.issubdtype(shape.dtype, jnp.floating) for shape in shapes):
         return None
     ways = itertools.product(("scan", "scan_unrolled", "compare_all", "sort"), ("left", "right"))
-    found = _find_own("searchsorted", body, [{"method": way, "side": side} for way, side in ways])
+    found = _match_library_call("searchsorted", body, [{"method": way, "side": side} for way, side in ways])
     return None if found is None else found["side"]
 
 
