@@ -129,7 +129,7 @@ class Frame:
     # ---- vectors, one element a lane ----
 
     def __getitem__(self, key: "str | tuple") -> Value:
-        name, *indices = _parts(key)
+        name, *indices = _key_parts(key)
         return self.code.load(self.address(name, *indices), ir.VectorType(DOUBLE, self.width))
 
     def __setitem__(self, key: "str | tuple", value: "Value | float") -> None:
@@ -138,7 +138,7 @@ class Frame:
         value = self.code.as_value(value, ir.VectorType(DOUBLE, self.width))
         if self._mask is not None:
             value = self.code.select(self._mask, value, self[key])
-        self.code.store(value, self.address(*_parts(key)))
+        self.code.store(value, self.address(*_key_parts(key)))
 
     @contextmanager
     def where(self, mask: Value) -> Iterator[None]:
@@ -230,11 +230,11 @@ class Lane:
         self._frame, self._index = frame, index
 
     def __getitem__(self, key: "str | tuple") -> Value:
-        name, *indices = _parts(key)
+        name, *indices = _key_parts(key)
         return self._frame.code.load(self.address(name, *indices), self._type_of(name))
 
     def __setitem__(self, key: "str | tuple", value: "Value | float") -> None:
-        name, *indices = _parts(key)
+        name, *indices = _key_parts(key)
         value = self._frame.code.as_value(value, self._type_of(name))
         self._frame.code.store(value, self.address(name, *indices))
 
@@ -248,5 +248,5 @@ class Lane:
         return frame.code.element(frame._memory, self._index + frame.layout.place(name, *indices))
 
 
-def _parts(key: "str | tuple") -> tuple:
+def _key_parts(key: "str | tuple") -> tuple:
     return key if isinstance(key, tuple) else (key,)

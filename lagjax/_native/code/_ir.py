@@ -34,17 +34,17 @@ _BEHIND_INTRINSICS = ("rint", "round", "floor", "ceil", "trunc", "fma", "fmod")
 
 
 @functools.cache
-def _target() -> llvm.Target:
+def _host_target() -> llvm.Target:
     """LLVM's target for this kind of processor, after LLVM is made ready."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     for name in _BEHIND_INTRINSICS:
-        _link(name)
+        _link_math_function(name)
     return llvm.Target.from_default_triple()
 
 
 @functools.cache
-def _link(name: str) -> None:
+def _link_math_function(name: str) -> None:
     if os.name == "nt":
         library = ctypes.CDLL("ucrtbase")
     else:
@@ -58,9 +58,9 @@ def _link(name: str) -> None:
 _LARGE, LEVELS = 2**20, [2, 1]
 
 
-def _machine(level: int) -> llvm.TargetMachine:
+def _target_machine(level: int) -> llvm.TargetMachine:
     """A target machine for this processor: an engine owns its own, and frees it in the end."""
-    return _target().create_target_machine(
+    return _host_target().create_target_machine(
         cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=level
     )
 
@@ -83,11 +83,11 @@ def compile_module(
 ) -> tuple[llvm.ExecutionEngine, dict[str, int]]:
     """Machine code for a module, and where its functions are: it lives as long as the engine. Empties the module."""
     text = str(module)
-    _release(module)
+    _empty_module(module)
     return compile_text(lambda: text, functions, text, LEVELS[len(text) > _LARGE] if level is None else level)
 
 
-def _release(module: ir.Module) -> None:
+def _empty_module(module: ir.Module) -> None:
     """Empty a module: its instructions are freed at once.
 
     Each of them refers to its block, which refers to all of them. Python's search for such circles took a quarter of
@@ -106,18 +106,18 @@ def compile_text(
     write: Callable[[], str], functions: tuple[str, ...], known_by: str, level: int
 ) -> tuple[llvm.ExecutionEngine, dict[str, int]]:
     """Machine code for the text of a module, which is written only where no object is kept that is known by this."""
-    machine = _machine(level)
+    machine = _target_machine(level)
     by = llvm.llvm_version_info, llvmlite.__version__, machine.triple, _PASSES, level
     processor = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
-    made = load_or_make(lambda: _object(write(), level), known_by, repr(by), *processor)
+    made = load_or_make(lambda: _compile_object(write(), level), known_by, repr(by), *processor)
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
     engine.add_object_file(llvm.ObjectFileRef.from_data(made))
     engine.finalize_object()
     return engine, {name: engine.get_function_address(name) for name in functions}
 
 
-def _object(text: str, level: int) -> bytes:
-    parsed, machine = llvm.parse_assembly(text), _machine(level)
+def _compile_object(text: str, level: int) -> bytes:
+    parsed, machine = llvm.parse_assembly(text), _target_machine(level)
     parsed.verify()
     builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=2))
     manager = llvm.create_new_module_pass_manager()
@@ -145,12 +145,12 @@ def unroll_loops(module: ir.Module) -> None:
                 entered.add(target)
 
 
-def _arithmetic(op: str) -> "tuple[Callable[[Value, Any], Value], Callable[[Value, Any], Value]]":
+def _arithmetic_operators(op: str) -> "tuple[Callable[[Value, Any], Value], Callable[[Value, Any], Value]]":
     """An operator of values, and the same where the value comes second."""
     return lambda x, y: x.code.arithmetic(op, x, y), lambda x, y: x.code.arithmetic(op, y, x)
 
 
-def _comparison(op: str) -> "Callable[[Value, Any], Value]":
+def _comparison_operator(op: str) -> "Callable[[Value, Any], Value]":
     return lambda x, y: x.code.compare(op, x, y)
 
 
@@ -161,11 +161,11 @@ class Value:
     code: "Code"
     it: Any
 
-    __add__, __radd__ = _arithmetic("add")
-    __sub__, __rsub__ = _arithmetic("sub")
-    __mul__, __rmul__ = _arithmetic("mul")
-    __truediv__, __rtruediv__ = _arithmetic("div")
-    __lt__, __le__, __gt__, __ge__ = map(_comparison, ("<", "<=", ">", ">="))
+    __add__, __radd__ = _arithmetic_operators("add")
+    __sub__, __rsub__ = _arithmetic_operators("sub")
+    __mul__, __rmul__ = _arithmetic_operators("mul")
+    __truediv__, __rtruediv__ = _arithmetic_operators("div")
+    __lt__, __le__, __gt__, __ge__ = map(_comparison_operator, ("<", "<=", ">", ">="))
 
     def __abs__(self):
         return self.code.intrinsic("fabs", self)
@@ -205,7 +205,7 @@ def element_of(kind: ir.Type) -> ir.Type:
 
 
 @functools.cache
-def _splat(kind: ir.Type, lanes: int) -> tuple[ir.Constant, ...]:
+def _splat_constants(kind: ir.Type, lanes: int) -> tuple[ir.Constant, ...]:
     """The constants that a number of this kind is put into all lanes with."""
     undefined = ir.Constant(ir.VectorType(kind, lanes), ir.Undefined)
     return undefined, ir.Constant(INTEGER, 0), ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
@@ -233,7 +233,7 @@ class Code:
         if not isinstance(x, Value):
             return Value(self, self._constant(x, like))
         if isinstance(like, ir.VectorType) and not isinstance(x.it.type, ir.VectorType):
-            undefined, begin, zeros = _splat(x.it.type, self.lanes)
+            undefined, begin, zeros = _splat_constants(x.it.type, self.lanes)
             first = self.builder.insert_element(undefined, x.it, begin)
             return Value(self, self.builder.shuffle_vector(first, undefined, zeros))
         return x
@@ -427,7 +427,7 @@ class Code:
         """A function of the C library, on scalars or lane by lane: one evaluation a step serves all orders."""
         xs = self._match_types(*xs) if len(xs) == 2 else xs
         kind, number = xs[0].it.type, element_of(xs[0].it.type)
-        _link(name)
+        _link_math_function(name)
         if not isinstance(kind, ir.VectorType):
             return self._call_by_name(name, number, xs)
         result = ir.Constant(kind, ir.Undefined)

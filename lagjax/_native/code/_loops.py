@@ -74,7 +74,7 @@ def integrate(
     kind(int(begin))(int(plan), *(x.ctypes.data for x in arrays), members, times, members, members)
 
 
-def _parse(text: str, mode: str) -> Any:
+def _parse_python(text: str, mode: str) -> Any:
     for _ in range(9):
         try:
             return ast.parse(text, mode=mode)
@@ -100,7 +100,7 @@ class Loop:
 
     @functools.cached_property
     def tree(self) -> ast.FunctionDef:
-        found = _parse(textwrap.dedent(inspect.getsource(self.function)), "exec").body[0]
+        found = _parse_python(textwrap.dedent(inspect.getsource(self.function)), "exec").body[0]
         assert isinstance(found, ast.FunctionDef)
         return found
 
@@ -153,20 +153,20 @@ def _write_module(entries: tuple[Loop, ...]) -> str:
     module, written = ir.Module("loops"), {}
     module.triple = ""
     for entry in entries:
-        _write(module, entry, written).function.linkage = ""
+        _write_loop(module, entry, written).function.linkage = ""
     return str(module)
 
 
-def _write(module: ir.Module, of: Loop, written: dict) -> Code:
+def _write_loop(module: ir.Module, of: Loop, written: dict) -> Code:
     if of not in written:
         kinds = [_KINDS.get(kind, POINTER) for kind in of.arguments.values()]
         code = Code(module, of.name, kinds, 1, _KINDS[of.result] if of.result else None)
         written[of] = code
-        _Writer(code, of, lambda other: _write(module, other, written)).write_all()
+        _LoopWriter(code, of, lambda other: _write_loop(module, other, written)).write_all()
     return written[of]
 
 
-class _Writer:
+class _LoopWriter:
     """The instructions of one loop. What an expression yields is its kind, a key of `_KINDS`, and its value."""
 
     def __init__(self, code: Code, of: Loop, write: Callable):
@@ -213,7 +213,7 @@ class _Writer:
             self.store(target, self.value(node.value))
 
     def do_AugAssign(self, node: ast.AugAssign):
-        read = _parse(ast.unparse(node.target), "eval").body
+        read = _parse_python(ast.unparse(node.target), "eval").body
         self.store(node.target, self.value(ast.BinOp(read, node.op, node.value)))
 
     def store(self, target, found: tuple[str, Value]) -> None:

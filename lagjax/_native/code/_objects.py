@@ -92,12 +92,12 @@ def load_or_make(make: Callable[[], bytes], *made_from: str) -> bytes:
     for text in made_from:
         digest.update(len(text).to_bytes(8, "little") + text.encode())
     file = place / f"{digest.hexdigest()}.o"
-    found = _read(file)
+    found = _read_object(file)
     if found is not None:
         return found
     made = make()
     with contextlib.suppress(OSError):
-        _write(file, made)
+        _write_object(file, made)
         _LEFT[place] = _LEFT.get(place, 0) - len(made)
         if _LEFT[place] <= 0:
             _remove_oldest(place)
@@ -105,7 +105,7 @@ def load_or_make(make: Callable[[], bytes], *made_from: str) -> bytes:
     return made
 
 
-def _read(file: Path) -> bytes | None:
+def _read_object(file: Path) -> bytes | None:
     """The bytes that were written to a file; None where there is none, it is damaged, or may be somebody else's."""
     try:
         number = os.open(file, os.O_RDONLY | _NO_LINK)
@@ -125,7 +125,7 @@ def _read(file: Path) -> bytes | None:
     return body
 
 
-def _write(file: Path, body: bytes) -> None:
+def _write_object(file: Path, body: bytes) -> None:
     number, name = tempfile.mkstemp(dir=file.parent, suffix=".part")
     try:
         with os.fdopen(number, "wb") as part:

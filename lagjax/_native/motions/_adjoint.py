@@ -54,16 +54,16 @@ class Adjoint:
             steps.insert(0, ProjectedEnd(motion, parts).pull(cotangents))
         if (saltation := self.replay.saltation()) is not None:
             steps = [saltation.pull(cotangents), *steps, saltation.note_after()]
-        self._run(steps)
+        self._run_function(steps)
         motion.write_begin(self.start_next)
         motion.finish()
 
     # ---- rounds ----
 
-    def _run(self, steps: list[Code]) -> None:
+    def _run_function(self, steps: list[Code]) -> None:
         """`run(job, memory, lanes, rounds)`: one step back in every lane a round; 1 if there is more to do."""
         frame = self.motion.function("run", INTEGER, result=INTEGER, public=True)
-        with self.replay.rounds(frame, frame.arguments[0], self._leave_step):
+        with self.replay.rounds(frame, frame.arguments[0], self._advance_step):
             for step in steps:
                 frame.call(step)
         frame.finish(self.motion.is_unfinished(frame))
@@ -84,7 +84,7 @@ class Adjoint:
         with frame.code.loop(self.motion.parameters) as i:
             lane["params_ct", i] = 0.0
 
-    def _leave_step(self, frame: Frame, lane: Lane, index: Value) -> None:
+    def _advance_step(self, frame: Frame, lane: Lane, index: Value) -> None:
         """One step less to go back; after the first one, write down the cotangents and take the next member."""
         code, member = frame.code, lane["member"]
         left = lane["step"] - 1

@@ -137,7 +137,7 @@ def write_function(
 
     `arguments` are types by name.
     """
-    kind, parts = numbers.type, _Parts(name, line, read, numbers)
+    kind, parts = numbers.type, _FunctionParts(name, line, read, numbers)
     given = ", ".join(arguments)
     taken = ", ".join(f"{of} {key}" if not of.endswith("*") else f"{of}{key}" for key, of in arguments.items())
     texts = [f"static const {kind} {table}[] = {{{entries}}};\n" for entries, table in parts.tables.items()]
@@ -151,7 +151,7 @@ def write_function(
     return "\n".join([*texts, f"void {name}({taken}, {kind} *restrict out)\n{{\n{body}}}\n"])
 
 
-class _Parts:
+class _FunctionParts:
     """The statements of a line as `bodies` of functions, the `room` that these share, and the `tables` they read."""
 
     def __init__(self, name: str, line: StraightLine, read: Callable[[int], str], numbers: CNumbers):
@@ -161,13 +161,13 @@ class _Parts:
         reads = {i for i, (op, _, _) in enumerate(line.nodes) if op == "input"} - set(line.outputs)
         named = [i for i, count in enumerate(self.uses) if count and not (self.inlined[i] or i in reads)]
         self.home = {i: k // LONGEST_IN_C for k, i in enumerate(named)}
-        self.last = self._find_last(named)
+        self.last = self._last_readers(named)
         self.bodies, self.room, self.free = [], 0, []
         self.tables: dict[str, str] = {}  # names by what they hold
         self.slots: dict[int, int] = {}
         for part in range(max(1, math.ceil(len(named) / LONGEST_IN_C))):
             self.here, self.text, self.known = part, [], set()
-            self._write_part(named[part * LONGEST_IN_C : (part + 1) * LONGEST_IN_C])
+            self._write_function_body(named[part * LONGEST_IN_C : (part + 1) * LONGEST_IN_C])
             self.bodies.append("".join(f"    {statement}\n" for statement in self.text))
 
     def _find_inlined(self) -> list[bool]:
@@ -185,7 +185,7 @@ class _Parts:
             inlined[i] |= op == "constant"
         return inlined
 
-    def _find_last(self, named: list[int]) -> dict[int, int]:
+    def _last_readers(self, named: list[int]) -> dict[int, int]:
         """The last part that reads each node with a name."""
         last = dict(self.home)
         for i in named:
@@ -198,16 +198,16 @@ class _Parts:
                     last[x] = max(last[x], self.home[i])
         return last
 
-    def _write_part(self, named: list[int]) -> None:
+    def _write_function_body(self, named: list[int]) -> None:
         places: dict[int, list[int]] = {}
         for k, i in enumerate(self.line.outputs):
             places.setdefault(i, []).append(k)
         if not self.here:
             constants = [i for i in places if self.line.nodes[i][0] == "constant"]
             zero = self.numbers.constant(0.0)
-            zeros = [i for i in constants if len(places[i]) > MOST_ZEROS and self._refer(i) == zero]
+            zeros = [i for i in constants if len(places[i]) > MOST_ZEROS and self._operand(i) == zero]
             self.text += [f"for (long i = 0; i < {len(self.line.outputs)}; i++) out[i] = 0;" for _ in zeros]
-            self.text += [f"out[{k}] = {self._refer(i)};" for i in constants if i not in zeros for k in places[i]]
+            self.text += [f"out[{k}] = {self._operand(i)};" for i in constants if i not in zeros for k in places[i]]
         for i in named:
             self._write_statement(i)
             self.text += [f"out[{k}] = v{i};" for k in places.get(i, ())]
@@ -222,37 +222,37 @@ class _Parts:
     def _write_statement(self, i: int) -> None:
         op, operands, _ = self.line.nodes[i]
         if op not in ("sin", "cos"):
-            self._declare(i, self._express(i))
+            self._declare_number(i, self._expression_text(i))
             return
         angle, kind = operands[0], self.numbers.type
         if -1 - angle not in self.known:
             self.known.add(-1 - angle)
-            self.text.append(f"{kind} s{angle}, c{angle}; turn({self._refer(angle)}, &s{angle}, &c{angle});")
-        self._declare(i, f"{op[0]}{angle}")
+            self.text.append(f"{kind} s{angle}, c{angle}; turn({self._operand(angle)}, &s{angle}, &c{angle});")
+        self._declare_number(i, f"{op[0]}{angle}")
 
-    def _declare(self, i: int, expression: str) -> None:
+    def _declare_number(self, i: int, expression: str) -> None:
         self.known.add(i)
         kinds = {"float": self.numbers.type, "bool": "int"} | _WHOLE_TYPES
         self.text.append(f"const {kinds[self.line.kinds[i]]} v{i} = {expression};")
 
-    def _refer(self, i: int) -> str:
+    def _operand(self, i: int) -> str:
         """The name of a node, or its expression; what stands in another part is read here first."""
         op, _, attribute = self.line.nodes[i]
         if op == "constant":
             is_float = self.line.kinds[i] == "float"
             return self.numbers.constant(attribute) if is_float else f"({int(attribute)})"
         if self.inlined[i]:
-            return f"({self._express(i)})"
+            return f"({self._expression_text(i)})"
         if i not in self.known:
             truth = " != 0" * (self.line.kinds[i] == "bool")
-            self._declare(i, self._express(i) if op == "input" else f"w[{self.slots[i]}]{truth}")
+            self._declare_number(i, self._expression_text(i) if op == "input" else f"w[{self.slots[i]}]{truth}")
         return f"v{i}"
 
-    def _express(self, i: int) -> str:
+    def _expression_text(self, i: int) -> str:
         op, operands, attribute = self.line.nodes[i]
         if op == "input":
             return self.read(attribute) + " != 0" * (self.line.kinds[i] == "bool")
-        xs = [self._refer(x) for x in operands]
+        xs = [self._operand(x) for x in operands]
         if op == "convert":
             return f"{xs[0]} != 0" if self.line.kinds[i] == "bool" else xs[0]
         if op in LOOK_UPS:

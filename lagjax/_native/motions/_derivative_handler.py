@@ -80,16 +80,16 @@ class _DerivativeCode(PlanCode):
     def __init__(self, module: ir.Module, kind: Kind):
         super().__init__(module, "derivative", DerivativePlan, (*ARGUMENTS, *RESULTS))
         self.kind = kind
-        self._carve()
+        self._place_arrays()
         code, done = self.code, self.known["done"]
         code.store(code.as_value(0.0, DOUBLE), done)
-        with code.only_if(self._run()):
-            self._order()
+        with code.only_if(self._run_motions()):
+            self._sort_steps()
             self._begin_results()
-            more = self._differentiate()
+            more = self._differentiate_steps()
             code.store(code.select(code.compare("==", more, 0), code.as_value(1.0, DOUBLE), 0.0), done)
 
-    def _carve(self) -> None:
+    def _place_arrays(self) -> None:
         """Give every array of the scratch its place: the memories of both kernels first, on cache lines, of zeros."""
         code, known, scratch = self.code, self.known, self.known["scratch"]
         end, rows = code.element(scratch, self.skipped(scratch)), known["room"] * (known["states"] + RECORDED)
@@ -111,14 +111,14 @@ class _DerivativeCode(PlanCode):
                 zeros = total
         code.fill(end, zeros)
 
-    def _counter(self, i: int) -> Value:
+    def _new_counter(self, i: int) -> Value:
         return self.code.element(self.at["counters"], i, INTEGER)
 
-    def _run(self) -> Value:
+    def _run_motions(self) -> Value:
         """Run the motions, with their steps written down; whether all reached their end."""
         code, place = self.code, self.at
-        fields = place | dict(record=place["rows"], next_member=self._counter(0), next_row=self._counter(1))
-        memory = place["memory"], place["lane_integers"], self._counter(2)
+        fields = place | dict(record=place["rows"], next_member=self._new_counter(0), next_row=self._new_counter(1))
+        memory = place["memory"], place["lane_integers"], self._new_counter(2)
         more = self.run("", _integrator.JOB, fields, *memory, rounds=self.known["rounds"])
         well = code.variable(code.select(code.compare("==", more, 0), code.as_value(1, INTEGER), 0))
         with code.only_if(well.value > 0), code.loop(self.known["members"]) as i:
@@ -127,7 +127,7 @@ class _DerivativeCode(PlanCode):
                 well.value = 0
         return well.value > 0
 
-    def _order(self) -> None:
+    def _sort_steps(self) -> None:
         """The rows of the steps, member by member."""
         code, place, width = self.code, self.at, self.known["states"] + RECORDED
         first = code.variable(code.as_value(0, INTEGER))
@@ -137,7 +137,7 @@ class _DerivativeCode(PlanCode):
             code.store(count, code.element(place["counts"], i, INTEGER))
             code.store(begin, code.element(place["first_step"], i, INTEGER))
             first.value = begin + count
-        with code.loop(code.load(self._counter(1), INTEGER)) as i:
+        with code.loop(code.load(self._new_counter(1), INTEGER)) as i:
             row = code.element(place["rows"], i * width)
             member, step = (code.as_integer(code.load(code.element(row, k), DOUBLE)) for k in (2, 3))
             to = code.load(code.element(place["first_step"], member, INTEGER), INTEGER) + step
@@ -149,12 +149,12 @@ class _DerivativeCode(PlanCode):
         code.fill(known["second"], known["members"] * known["others"], self.kind.begin)
         code.fill(known["excess"], known["members"])
 
-    def _differentiate(self) -> Value:
+    def _differentiate_steps(self) -> Value:
         """The derivative over the steps; 1 if there is more to do."""
         known, place, kind = self.known, self.at, self.kind
         fields = {kind.argument: known["argument"], kind.first: known["first"], kind.second: known["second"]}
         fields |= dict(record=place["record"], first_step=place["first_step"], steps=place["counts"])
-        fields |= dict(next_member=self._counter(3))
+        fields |= dict(next_member=self._new_counter(3))
         memory = place["memory_of_derivative"], place["lane_integers_of_derivative"]
         rounds = known["room"] + known["members"]  # a step a round, and more where a lane takes a member
         return self.run("_derivative", kind.job, fields, *memory, rounds=rounds)

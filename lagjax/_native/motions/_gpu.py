@@ -77,17 +77,17 @@ class GpuPrograms:
 
     def _assemble_motion(self, form: GpuForm) -> str:
         with _lock:
-            return _assembly(motion_entry(self._lane(), form.order), [_parse(self._lane(), form)])
+            return _compile_ptx(motion_entry(self._lane(), form.order), [_parse_module(self._lane(), form)])
 
     def _assemble_transpose(self, form: GpuForm) -> str:
         """The PTX of an integrator and of its adjoint, one after the other in one thread."""
         lane, back = self._lane(), self._lane_back()
         require_room(lane.size + back.size if form.unrolled else max(lane.size, back.size))
         with _lock:
-            there_and_back = [_parse(lane, form), _parse(back, form)]
+            there_and_back = [_parse_module(lane, form), _parse_module(back, form)]
             for name in ("begin", "run"):
                 there_and_back[1].get_function(name).name = f"{name}_back"
-            return _assembly(transpose_entry(lane, back, form), there_and_back)
+            return _compile_ptx(transpose_entry(lane, back, form), there_and_back)
 
 
 def form_for(entry: Entry, lane: OneLane, order: int) -> GpuForm:
@@ -118,13 +118,13 @@ def one_lane(motion: TaylorSeries) -> OneLane:
     return OneLane.from_motion(motion)
 
 
-def _parse(lane: OneLane, form: GpuForm) -> llvm.ModuleRef:
+def _parse_module(lane: OneLane, form: GpuForm) -> llvm.ModuleRef:
     return llvm.parse_assembly(lane.unrolled if form.unrolled else lane.text)
 
 
-def _assembly(entry: str, parts: Sequence[llvm.ModuleRef]) -> str:
+def _compile_ptx(entry: str, parts: Sequence[llvm.ModuleRef]) -> str:
     """The PTX of an entry, linked with the modules that it calls."""
-    machine = _target().create_target_machine(cpu=_PROCESSOR, features=_VERSION, opt=3)
+    machine = _gpu_target().create_target_machine(cpu=_PROCESSOR, features=_VERSION, opt=3)
     called = [of for part in parts for of in part.functions if of.is_declaration and not of.name.startswith("llvm.")]
     external = [of for of in called if of.name not in _FAR_ANGLES]
     whole, others = llvm.parse_assembly(entry), [*parts, _refuse_far_angles()]
@@ -145,7 +145,7 @@ def _assembly(entry: str, parts: Sequence[llvm.ModuleRef]) -> str:
         if not function.is_declaration and function.name != "integrate":
             function.linkage = "internal"  # else all of the library stays
     whole.verify()
-    return machine.emit_assembly(_optimise(whole, machine))
+    return machine.emit_assembly(_inline_functions(whole, machine))
 
 
 def _refuse_far_angles() -> llvm.ModuleRef:
@@ -162,7 +162,7 @@ def _refuse_far_angles() -> llvm.ModuleRef:
     return llvm.parse_assembly(str(module))
 
 
-def _optimise(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> llvm.ModuleRef:
+def _inline_functions(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> llvm.ModuleRef:
     """The module with its functions in one another, and its loops as they are but for those that ask to be unrolled."""
     for function in module.functions:
         if not function.is_declaration and function.name != "integrate":
@@ -178,7 +178,7 @@ def _optimise(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> llvm.Modul
 
 
 @functools.cache
-def _target() -> llvm.Target:
+def _gpu_target() -> llvm.Target:
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
     return llvm.Target.from_triple("nvptx64-nvidia-cuda")

@@ -93,7 +93,7 @@ class OneLane(NamedTuple):
 
 def motion_entry(motion: OneLane, order: int) -> str:
     """The module of `MOTION`, `integrate(*arguments, *results)`: it calls the `begin` and `run` of an `_integrator`."""
-    thread = _Thread(MOTION)
+    thread = _IntegrateEntry(MOTION)
     job = job_of(thread.code, _integrator.JOB, thread.at | thread.numbers | {"order": integer(thread.code, order)})
     thread.run("", motion, job, thread.memory(motion.size), thread.code.stack(1))
     return thread.finish()
@@ -101,10 +101,10 @@ def motion_entry(motion: OneLane, order: int) -> str:
 
 def transpose_entry(motion: OneLane, adjoint: OneLane, form: GpuForm) -> str:
     """The module of `TRANSPOSE`: it calls an integrator, and an `_adjoint` by the names `begin_back` and `run_back`."""
-    return _Transpose(motion, adjoint, form).finish()
+    return _TransposeEntry(motion, adjoint, form).finish()
 
 
-class _Thread:
+class _IntegrateEntry:
     """Emits the GPU kernel `integrate`. `at`: addresses of its array arguments and results, by name."""
 
     def __init__(self, entry: Entry):
@@ -130,11 +130,11 @@ class _Thread:
     def run(self, name: str, motion: OneLane, job: Value, memory: Value, *more: Value) -> None:
         """Begin and run the members of a job, all of them, in a memory that is cleared before."""
         bits = ir.Constant(ir.IntType(8), 0), integer(self.code, 8 * motion.size), ir.Constant(BIT, 0)
-        self._call("llvm.memset.p0.i64", memory, *bits)
-        self._call(f"begin{name}", job, memory, self.lanes)
-        self._call(f"run{name}", job, memory, self.lanes, *more, integer(self.code, _ROUNDS), result=INTEGER)
+        self._call_function("llvm.memset.p0.i64", memory, *bits)
+        self._call_function(f"begin{name}", job, memory, self.lanes)
+        self._call_function(f"run{name}", job, memory, self.lanes, *more, integer(self.code, _ROUNDS), result=INTEGER)
 
-    def _call(self, name: str, *arguments, result: ir.Type | None = None) -> Value:
+    def _call_function(self, name: str, *arguments, result: ir.Type | None = None) -> Value:
         values = [getattr(x, "it", x) for x in arguments]
         function = self.module.globals.get(name)
         if function is None:
@@ -144,7 +144,7 @@ class _Thread:
 
     def index(self) -> Value:
         def register(name):
-            read = self._call(f"llvm.nvvm.read.ptx.sreg.{name}.x", result=_WORD)
+            read = self._call_function(f"llvm.nvvm.read.ptx.sreg.{name}.x", result=_WORD)
             return Value(self.code, self.code.builder.zext(read.it, INTEGER))
 
         return register("ctaid") * register("ntid") + register("tid")
@@ -159,7 +159,7 @@ class _Thread:
             member.value = code.count_up(counter)
 
 
-class _Transpose(_Thread):
+class _TransposeEntry(_IntegrateEntry):
     """Writes down `transpose_entry`."""
 
     def __init__(self, motion: OneLane, adjoint: OneLane, form: GpuForm):
@@ -176,9 +176,9 @@ class _Transpose(_Thread):
         shared = None if form.unrolled else self.memory(max(motion.size, adjoint.size))
         self.memories = [shared or self.memory(lane.size) for lane in (motion, adjoint)]
         with self.members() as member:
-            self._transpose(member)
+            self._transpose_motion(member)
 
-    def _transpose(self, member: Value) -> None:
+    def _transpose_motion(self, member: Value) -> None:
         code, numbers = self.code, self.numbers
 
         def member_address(name: str, stride: Value | int) -> Value:
@@ -186,7 +186,7 @@ class _Transpose(_Thread):
 
         ts, params = member_address("ts", numbers["ts_stride"]), member_address("params", numbers["params_stride"])
         y_ct, params_ct = member_address("y_ct", self.states), member_address("params_ct", self.motion.numbers)
-        self._follow(ts, member_address("y0", self.states), params)
+        self._follow_motion(ts, member_address("y0", self.states), params)
         code.copy(member_address("end_ct", self.states), y_ct, self.states)
         code.fill(params_ct, self.motion.numbers)
         code.store(code.as_value(0.0, DOUBLE), member_address("excess", 1))
@@ -194,10 +194,10 @@ class _Transpose(_Thread):
         code.store(code.flag(fits), member_address("done", 1))
         with code.only_if(fits):
             path_ct = member_address("path_ct", numbers["times"] * self.states)
-            self._go_back(ts=ts, params=params, path_ct=path_ct, y_ct=y_ct, params_ct=params_ct,
+            self._transpose_steps(ts=ts, params=params, path_ct=path_ct, y_ct=y_ct, params_ct=params_ct,
                           excess=member_address("excess", 1))  # fmt: skip
 
-    def _follow(self, ts: Value, y0: Value, params: Value) -> None:
+    def _follow_motion(self, ts: Value, y0: Value, params: Value) -> None:
         """The motion from the first output time to the last one, with its steps written down."""
         code, own = self.code, self.own
         for i, time in enumerate((integer(self.code, 0), self.numbers["times"] - 1)):
@@ -208,7 +208,7 @@ class _Transpose(_Thread):
         fields |= dict(ts=self.ends, y0=y0, params=params, path=self.path, y_end=self.y_end)
         self.run("", self.motion, job_of(code, _integrator.JOB, fields), self.memories[0], own["idle"])
 
-    def _go_back(self, **arrays: Value) -> None:
+    def _transpose_steps(self, **arrays: Value) -> None:
         """The transposes of the steps that were written down, from the last one."""
         code, own = self.code, self.own
         taken = code.as_integer(code.load(own["steps"], DOUBLE))

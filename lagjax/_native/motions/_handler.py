@@ -116,7 +116,7 @@ class Handler:
     """
 
     def __init__(self):
-        places = compile_handler("handler", len(ARGUMENTS), len(RESULTS), _write_run, "begin_run")
+        places = compile_handler("handler", len(ARGUMENTS), len(RESULTS), _write_begin_run, "begin_run")
         self.address, pointers = places["handler"], 1 + len(ARGUMENTS) + len(RESULTS)
         kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * pointers, *[ctypes.c_int64] * 4)
         self.begin = kind(places["begin_run"])
@@ -174,16 +174,16 @@ def _tell_version(code: Code, extension: Value) -> None:
     """XLA asks once, when the handler is registered, for which version of the interface it was written."""
     metadata, short = load_at(extension, _METADATA, POINTER), ir.IntType(32)
     for offset, number in ((_MAJOR, MAJOR), (_MINOR, MINOR), (_TRAITS, 0)):
-        code.builder.store(ir.Constant(short, number), _address(metadata, offset).it)
-    code.store(code.as_value(0, INTEGER), _address(metadata, _STATE_TYPE))  # a handler without state
+        code.builder.store(ir.Constant(short, number), _function_address(metadata, offset).it)
+    code.store(code.as_value(0, INTEGER), _function_address(metadata, _STATE_TYPE))  # a handler without state
 
 
-def _address(base: Value, offset: int) -> Value:
+def _function_address(base: Value, offset: int) -> Value:
     return base.code.element(base, offset, ir.IntType(8))
 
 
 def load_at(base: Value, offset: int, kind: ir.Type) -> Value:
-    return base.code.load(_address(base, offset), kind)
+    return base.code.load(_function_address(base, offset), kind)
 
 
 def element(array: Value, index: int) -> Value:
@@ -240,7 +240,7 @@ class PlanCode:
         return work
 
 
-def _write_run(module: ir.Module) -> Callable:
+def _write_begin_run(module: ir.Module) -> Callable:
     """`begin_run(plan, *arguments, *results, members, times, rows of ts, rows of params)`."""
     run = PlanCode(module, "begin_run", Plan, (*ARGUMENTS, *RESULTS))
     code, known = run.code, run.known

@@ -80,7 +80,7 @@ class Integrator:
         roots = Roots(motion) if guards and self.borders is None else self.borders and self.borders.roots
         self.events = guards and roots and Events(motion, self.step, self.output, roots, guards)
         self.start_next = self._start_next()
-        self._run()
+        self._run_function()
         motion.write_begin(self.start_next)
         motion.finish()
 
@@ -100,10 +100,10 @@ class Integrator:
         lane["active"] = code.flag(there)
         lane["code"], lane["due"], lane["event"] = float(RUNNING), float("inf"), -1.0
         with code.only_if(there):
-            self._take(frame, lane, member)
+            self._load_member(frame, lane, member)
         return frame.finish()
 
-    def _take(self, frame: Frame, lane: Lane, member: Value) -> None:
+    def _load_member(self, frame: Frame, lane: Lane, member: Value) -> None:
         """Times, initial state and parameters of the member that a lane has taken."""
         code, motion = frame.code, self.motion
         begin, end = (frame.time(member, i) for i in (0, frame.job("times") - 1))
@@ -129,7 +129,7 @@ class Integrator:
 
     # ---- rounds ----
 
-    def _run(self) -> None:
+    def _run_function(self) -> None:
         """`run(job, memory, lanes, idle, rounds)`: 1 if there is more to do after these. `idle` counts idle lanes."""
         frame = self.motion.function("run", POINTER, INTEGER, result=INTEGER, public=True)
         code, (idle, rounds) = frame.code, frame.arguments

@@ -157,17 +157,17 @@ class Kernel:
         return _gpu.GpuPrograms(motion, lambda: Adjoint(self._derivative_parts, width=1).motion)
 
     @functools.cached_property
-    def _forward(self) -> "_Compiled":
-        return _Compiled(self._integrator(), self._rounds)
+    def _forward(self) -> "_CompiledRun":
+        return _CompiledRun(self._integrator(), self._rounds)
 
     @property
-    def _notes(self) -> bool:
+    def _notes_crossings(self) -> bool:
         return self._guards is not None and self._guards.notes
 
     @property
     def ending_guards(self) -> int:
         """The number of guards that end a motion."""
-        return 0 if self._guards is None or self._notes else len(self._guards.directions)
+        return 0 if self._guards is None or self._notes_crossings else len(self._guards.directions)
 
     @property
     def rest_size(self) -> int:
@@ -185,15 +185,15 @@ class Kernel:
         Where guards are noted, with this much room for each, `path` holds the notes for one guard after the other: a
         time, and the state then, (N, guards (room + 1), 1 + 2n); behind them how many there would have been.
         """
-        ts, y0, params = _contiguous(ts, y0, params)
+        ts, y0, params = _contiguous_doubles(ts, y0, params)
         members, times = len(y0), ts.shape[1]
         if begun is not None:
             begun = Begun(*(np.array(x, np.float64) for x in begun))
-        elif room == 0 and self.threads(members) == 1 and not self._notes and not order:
+        elif room == 0 and self.threads(members) == 1 and not self._notes_crossings and not order:
             begun = self._begin_run(ts, y0, params, self.plan(rtol, atol, max_steps))
         if begun is None:
             shape = (times, self.states)
-            if self._notes and (guards := self._guards) is not None:
+            if self._notes_crossings and (guards := self._guards) is not None:
                 shape = len(guards.directions) * (room_of_notes + 1), self.states + 1
             path, y_end = np.full((members, *shape), np.nan), np.empty((members, self.states))
             t_end, code, steps, rejected = np.empty((4, members))
@@ -202,7 +202,7 @@ class Kernel:
             path, y_end, t_end, code, steps, rejected, changes, rest = begun
             idle, _, more = Rest.counts(rest)
             if not more:
-                return _outcome(path, y_end, t_end, code, steps, rejected, changes, idle)
+                return _collect_results(path, y_end, t_end, code, steps, rejected, changes, idle)
         rest = None if begun is None else Rest.from_array(begun.rest, self._forward.layout)
         table, rows = None, np.zeros(1, np.int64)
         if room:  # the system provides pages when they are written to
@@ -218,7 +218,7 @@ class Kernel:
         )  # fmt: skip
         idle = self._forward(arrays, numbers, self.threads(members) if rest is None else 1, rest)
         table = None if table is None else table[: rows[0]]
-        return _outcome(path, y_end, t_end, code, steps, rejected, changes, idle, table)
+        return _collect_results(path, y_end, t_end, code, steps, rejected, changes, idle, table)
 
     def _begin_run(self, ts, y0, params, plan: Plan) -> Begun:
         """Run few members for a slice of time, by one call of machine code."""
@@ -244,10 +244,10 @@ class Kernel:
         y_ct = np.array(y_ct, np.float64, order="C")
         results = y_ct, np.zeros((len(y_ct), self.numbers)), np.zeros(len(y_ct))
         arrays = dict(zip(("y_ct", "params_ct", "excess"), results, strict=True)) | dict(path_ct=path_ct)
-        self._go_over(self._transpose_kernel(len(y_ct)), ts, params, record, arrays)
+        self._run_derivative(self._transpose_kernel(len(y_ct)), ts, params, record, arrays)
         return results
 
-    def _transpose_kernel(self, members: int) -> "tuple[_Compiled, int]":
+    def _transpose_kernel(self, members: int) -> "tuple[_CompiledRun, int]":
         """The transpose for this many members, and on how many threads."""
         kernel = self.select_width(1 if members < self.width / 2 else members)  # few are as fast one after the other
         # A vector of members is as much work as the motions of several, and worth a thread the sooner.
@@ -269,15 +269,15 @@ class Kernel:
         results = path_dot, y_dot, np.zeros(members)
         arrays = dict(zip(("path_dot", "y_dot", "excess"), results, strict=True)) | dict(params_dot=params_dot)
         kernel = self._tangent_kernel(members, directions)
-        self._go_over(kernel, ts, params, record, arrays, directions=directions, floor=floor)
+        self._run_derivative(kernel, ts, params, record, arrays, directions=directions, floor=floor)
         return results
 
-    def _go_over(
-        self, kernel: "tuple[_Compiled, int]", ts, params, record: Steps, arrays: dict, **numbers: float
+    def _run_derivative(
+        self, kernel: "tuple[_CompiledRun, int]", ts, params, record: Steps, arrays: dict, **numbers: float
     ) -> None:
         """Run a kernel of derivatives, with its number of threads, over the steps of a record; `arrays` are its own."""
         names = ("ts", "params", "record", *arrays)
-        arrays = dict(zip(names, _contiguous(ts, params, record.table, *arrays.values()), strict=True))
+        arrays = dict(zip(names, _contiguous_doubles(ts, params, record.table, *arrays.values()), strict=True))
         ts, params = arrays["ts"], arrays["params"]
         first, counts = (np.ascontiguousarray(x, np.int64) for x in (record.first, record.counts))
         arrays |= dict(next_member=np.zeros(1, np.int64), first_step=first, steps=counts)
@@ -285,7 +285,7 @@ class Kernel:
         compiled, threads = kernel
         compiled(arrays, numbers, threads)
 
-    def _tangent_kernel(self, members: int, directions: int) -> "tuple[_Compiled, int]":
+    def _tangent_kernel(self, members: int, directions: int) -> "tuple[_CompiledRun, int]":
         """The tangents of this many members along this many directions, and on how many threads."""
         if directions > 1 and members < self.width / 2:
             return self._tangents(True), min(cores(), members)
@@ -293,10 +293,10 @@ class Kernel:
         # A vector of members is as much work as there are directions, and worth a thread the sooner.
         return kernel._tangents(False), min(kernel.threads(members * directions), -(-members // kernel.width))
 
-    def _compile_tangents(self, side_by_side: bool) -> "_Compiled":
+    def _compile_tangents(self, side_by_side: bool) -> "_CompiledRun":
         """The kernel of tangents: directions of one member in its lanes, or members; compiled on first use."""
         width = 1 if side_by_side else self.width
-        return _Compiled(Tangent(self._derivative_parts, width=width, lanes=self.width), self._rounds)
+        return _CompiledRun(Tangent(self._derivative_parts, width=width, lanes=self.width), self._rounds)
 
     def plan(self, rtol: float, atol: float, max_steps: int) -> Plan:
         """The plan by which a handler begins a run; it lives as long as this kernel."""
@@ -334,8 +334,8 @@ class Kernel:
         return self._parts if self._guards is None else self._parts.drop_guards
 
     @functools.cached_property
-    def _backward(self) -> "_Compiled":
-        return _Compiled(Adjoint(self._derivative_parts, width=self.width), self._rounds)
+    def _backward(self) -> "_CompiledRun":
+        return _CompiledRun(Adjoint(self._derivative_parts, width=self.width), self._rounds)
 
     def _strides(self, ts, params) -> dict[str, int]:
         return dict(ts_stride=ts.shape[1] if len(ts) > 1 else 0, params_stride=self.numbers if len(params) > 1 else 0)
@@ -344,7 +344,7 @@ class Kernel:
         return min(cores(), max(1, members // (VECTORS_PER_THREAD * self.width)))
 
 
-class _Compiled:
+class _CompiledRun:
     """The functions `begin` and `run` of a module: all members of a job, on several threads.
 
     `rounds` is how many of them a slice has at first, `more` the numbers that are recorded behind the state of a step.
@@ -390,7 +390,7 @@ class _Compiled:
         return run_on_threads(work, threads)
 
 
-def _outcome(path, y_end, t_end, code, steps, rejected, changes, idle: int, table=None) -> Outcome:
+def _collect_results(path, y_end, t_end, code, steps, rejected, changes, idle: int, table=None) -> Outcome:
     """The results in the arrays of a finished run; NaN in the path where a member did not come."""
     ended_badly = code != DONE
     if ended_badly.any() and path.shape[2] == y_end.shape[1]:  # a start that is infinite was not reached either
@@ -419,7 +419,7 @@ def _sort_by_member(table: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, n
     return np.take(table, places, axis=0, mode="clip"), complete  # a third of the time of `table[places]`
 
 
-def _contiguous(*arrays) -> list[np.ndarray]:
+def _contiguous_doubles(*arrays) -> list[np.ndarray]:
     return [np.ascontiguousarray(x, dtype=np.float64) for x in arrays]
 
 

@@ -52,7 +52,7 @@ class LineCode:
         lanes, self.shared = (1, ()) if long else (lanes, tuple(shared))
         write = _RowWalk(line, inputs, filled, moving) if long else None
         common, rest = (None, line) if long else _split_line(line, inputs, filled, self.shared)
-        own, begin = inputs - len(self.shared), common and _write_common(module, common, len(self.shared))
+        own, begin = inputs - len(self.shared), common and _write_shared_part(module, common, len(self.shared))
         room = len(common.outputs) if common else 1 if write is None else 2 ** math.ceil(math.log2(2 * write.size))
         code, sincos = (
             Code(module, "evaluate", LINE_ARGUMENTS, lanes, public=True, rounds=True),
@@ -72,7 +72,7 @@ class LineCode:
                     if write is not None:
                         write(code, sincos, here, there, room)
                     else:
-                        _write_line(code, sincos, rest, own, filled, here, there, room)
+                        _write_line_outputs(code, sincos, rest, own, filled, here, there, room)
         code.finish()
         names = ("evaluate",) if write is None else ("evaluate", _SET_ROWS)
         level = 0 if write is None and compilation_work(rest, lanes) > WORK_OPTIMISED else None
@@ -155,18 +155,18 @@ def _sincos_of(module: ir.Module, line: StraightLine, lanes: int, name: str) -> 
     return sincos_function(module, lanes, f"sincos_{name}", rounds=True) if turns else None
 
 
-def _write_common(module: ir.Module, line: StraightLine, inputs: int) -> Code:
+def _write_shared_part(module: ir.Module, line: StraightLine, inputs: int) -> Code:
     """The function (inputs, outputs) of a line."""
     code, sincos = Code(module, "common", [POINTER, POINTER], 1, rounds=True), _sincos_of(module, line, 1, "common")
     given, out = code.arguments
     if compilation_work(line, 1) > WORK_OPTIMISED:
         for attribute in ("noinline", "optnone"):
             code.function.attributes.add(attribute)
-    _write_line(code, sincos, line, inputs, list(range(len(line.outputs))), given, out, given)
+    _write_line_outputs(code, sincos, line, inputs, list(range(len(line.outputs))), given, out, given)
     return code.finish()
 
 
-def _write_line(
+def _write_line_outputs(
     code: Code, sincos: Code | None, line: StraightLine, own: int, filled: list[int], x: Value, out: Value, room: Value
 ) -> None:
     """Write the outputs that are `filled` of a line, operation by operation; a number of x and `out` has all lanes.
@@ -204,7 +204,7 @@ def _write_tiles(
             row = code.element(x, (first.value + own) * inputs)
             with code.loop(inputs) as k:
                 code.store(code.load(code.element(row, k), DOUBLE), code.element(given, k * lanes + j))
-        _write_line(code, sincos, line, inputs, filled, given, found, room)
+        _write_line_outputs(code, sincos, line, inputs, filled, given, found, room)
         with code.loop(here) as j:
             row = code.element(out, (first.value + j) * outputs)
             with code.loop(outputs) as k:

@@ -79,7 +79,7 @@ class StepReplay:
         code = frame.code
         with self.motion.rounds(frame, rounds):
             with code.loop(self.motion.width) as index:
-                self._recall(frame, frame.lane(index))
+                self._recall_step(frame, frame.lane(index))
             if self._retract is not None:
                 frame.call(self._retract)
             frame.call(self.motion.coefficients, frame.job("order"))
@@ -93,7 +93,7 @@ class StepReplay:
         """The place in the record of the step that a lane is at."""
         return (frame.read("first_step", lane["member"], INTEGER) + lane["step"]) * self.size
 
-    def _recall(self, frame: Frame, lane: Lane) -> None:
+    def _recall_step(self, frame: Frame, lane: Lane) -> None:
         """The time, size, first state and pieces of the step that the lane is at, and the border that it ends at."""
         motion, code = self.motion, frame.code
         with code.only_if(lane["member"] >= 0):

@@ -48,26 +48,26 @@ class Tangent:
         products, recursion = CauchyProducts(motion), OrderRecursion(motion, parts)
         self.products, self.recursion = products.push(directions), recursion.push(directions)
         steps = [
-            self._take(), self._series(ZerothOrder(motion, parts)), self._end(), self._measure(), self._outputs(),
-            self._leave(),
+            self._load(), self._series(ZerothOrder(motion, parts)), self._end(), self._last_terms(), self._outputs(),
+            self._store_end(),
         ]  # fmt: skip
         self.projected_end = parts.projection and ProjectedEnd(motion, parts)
         if self.projected_end is not None:
             steps.insert(4, self.projected_end.push(directions))
-        self._run(steps)
+        self._run_function(steps)
         motion.write_begin(self.start_next, self.form)
         self.form.finish()
         motion.finish()
 
     # ---- rounds ----
 
-    def _run(self, steps: list[Code]) -> None:
+    def _run_function(self, steps: list[Code]) -> None:
         """`run(job, memory, lanes, rounds)`: one step in every lane a round; 1 if there is more to do."""
         frame = self.motion.function("run", INTEGER, result=INTEGER, public=True)
         code, (rounds,) = frame.code, frame.arguments
         directions, per_group = frame.job("directions"), self.directions.lanes // self.motion.width
-        with self.replay.rounds(frame, rounds, self._leave_step):
-            self._await_end(frame)
+        with self.replay.rounds(frame, rounds, self._advance_step):
+            self._set_step_end(frame)
             if self.projected_end is not None:
                 self.projected_end.note_argument(frame)
             with code.loop((directions + (per_group - 1)) / per_group) as group:
@@ -85,7 +85,7 @@ class Tangent:
         if self.saltation is not None:
             lane["is_hit"] = 0.0
 
-    def _await_end(self, frame: Frame) -> None:
+    def _set_step_end(self, frame: Frame) -> None:
         """Set the beginning of the next step of every lane, up to which outputs belong to this one."""
         code = frame.code
         with code.loop(self.motion.width) as index:
@@ -97,7 +97,7 @@ class Tangent:
                 with code.only_if(lane["step"] + 1 < frame.read("steps", lane["member"], INTEGER)):
                     lane["next_begin"] = frame.read("record", self.replay.row(frame, lane) + self.replay.size)
 
-    def _leave_step(self, frame: Frame, lane: Lane, index: Value) -> None:
+    def _advance_step(self, frame: Frame, lane: Lane, index: Value) -> None:
         """Write down how large the last terms were, and go one step on; after the last one take the next member."""
         code, member, tangents = frame.code, lane["member"], self.directions.lanes_of_tangents(frame, index)
         largest = functools.reduce(code.maximum, [of_lane["excess"] for of_lane in tangents])
@@ -110,13 +110,13 @@ class Tangent:
 
     # ---- one step along one direction in every lane; `group` numbers the directions ----
 
-    def _step(self, name: str) -> tuple[Frame, Code, Value]:
+    def _step_function(self, name: str) -> tuple[Frame, Code, Value]:
         frame = self.directions.function(name, INTEGER)
         return frame, frame.code, frame.arguments[0]
 
-    def _take(self) -> Code:
+    def _load(self) -> Code:
         """`(group)`: the tangents of the state and of the parameters; zero where there is no such direction."""
-        frame, code, group = self._step("take")
+        frame, code, group = self._step_function("take")
         for i in self.form.each(code, self.motion.states):
             frame["dy", i, 0] = 0.0
         for i in self.form.each(code, self.motion.parameters):
@@ -140,7 +140,7 @@ class Tangent:
 
     def _series(self, zeroth_order: ZerothOrder) -> Code:
         """`(group)`: the series of the tangents of the state."""
-        frame, code, _ = self._step("series")
+        frame, code, _ = self._step_function("series")
         zeroth_order.push(self.directions, frame)
         for i in self.form.each(code, len(self.motion.series.cauchy_products)):
             frame["dsums", i] = 0.0
@@ -152,16 +152,16 @@ class Tangent:
 
     def _end(self) -> Code:
         """`(group)`: the tangents of the state at the end of the series."""
-        frame, _, _ = self._step("end")
+        frame, _, _ = self._step_function("end")
         self.series_sum.push(self.directions, frame, "end", self.directions.number_of(frame, "h"), powers=True)
         return frame.finish()
 
-    def _measure(self) -> Code:
+    def _last_terms(self) -> Code:
         """`(group)`: the largest of the last two terms, relative to the tangent itself; of coordinates, of velocities.
 
         What is smaller than the `floor` counts as that: a tangent that is zero consists of rounding.
         """
-        frame, code, _ = self._step("measure")
+        frame, code, _ = self._step_function("measure")
         order, powers = frame.job("order"), [frame["power_before"], frame["power"]]
 
         def last_terms(first):
@@ -179,7 +179,7 @@ class Tangent:
 
     def _outputs(self) -> Code:
         """`(group)`: the tangents of the outputs from the beginning of the step to that of the next one."""
-        frame, code, group = self._step("outputs")
+        frame, code, group = self._step_function("outputs")
         frame["is_due"] = 1.0
         with code.repeat_while(lambda: code.any_lane(frame["is_due"] > 0.0)):
             with code.loop(self.directions.lanes) as index:
@@ -213,9 +213,9 @@ class Tangent:
                     frame.write("path_dot", row + i, lane["between", i])
             lane["next_output"] = lane["next_output"] + 1.0
 
-    def _leave(self) -> Code:
+    def _store_end(self) -> Code:
         """`(group)`: write down the tangents of the end of the step, with which the next one begins."""
-        frame, code, group = self._step("leave")
+        frame, code, group = self._step_function("leave")
         with code.loop(self.directions.lanes) as index:
             lane, (place, there) = frame.lane(index), self.directions.place(frame, group, index)
             with code.only_if(there):

@@ -61,7 +61,7 @@ def run_on_threads(work: Callable[[Callable[[], bool]], int], count: int) -> int
         stop.set()
         raise
     finally:
-        _wait(helpers, ended, signal, stop)
+        _wait_for_helpers(helpers, ended, signal, stop)
     for result in ended:
         if isinstance(result, BaseException):
             raise result
@@ -69,7 +69,7 @@ def run_on_threads(work: Callable[[Callable[[], bool]], int], count: int) -> int
     return total
 
 
-def _wait(helpers: int, ended: list, signal: queue.SimpleQueue, stop: threading.Event) -> None:
+def _wait_for_helpers(helpers: int, ended: list, signal: queue.SimpleQueue, stop: threading.Event) -> None:
     """Until all helpers have ended. An interrupt meanwhile stops them, and is raised when they have."""
     interrupt = None
     while len(ended) < helpers:

@@ -98,7 +98,7 @@ def emit(
 def apply(code: Code, op: str, xs: list[Value], attribute, kinds: Sequence[str], kind: str) -> Value:
     """An operation of operands of these `kinds` by its row: of the C library, lane by lane, or written with vectors."""
     if op == "convert":
-        return _convert(code, xs[0], kinds[0], kind)
+        return _convert_integer(code, xs[0], kinds[0], kind)
     is_whole = kind not in ("float", "bool")
     how = INTEGERS.get(op) if is_whole else OPERATIONS[op].llvm
     if op == "mul" and kind in ("int32", "uint32"):
@@ -107,7 +107,7 @@ def apply(code: Code, op: str, xs: list[Value], attribute, kinds: Sequence[str],
         raise Unlowerable(f"`{op}`{' of integers' if is_whole else ''} has no machine code here")
     more = () if attribute is None else (attribute,)
     x = code.library(how, *xs) if isinstance(how, str) else how(code, *xs, *more)
-    return _wrap(code, x, kind) if is_whole else x
+    return _wrap_integer(code, x, kind) if is_whole else x
 
 
 def _combine_bits(op: str) -> Callable:
@@ -120,14 +120,14 @@ def _combine_bits(op: str) -> Callable:
     return combine
 
 
-def _convert(code, x, before, after):
+def _convert_integer(code, x, before, after):
     if before == "bool":
         return code.as_number(x)
     if after == "bool":
         return code.compare("!=", x, 0.0)
     if after == "float":
         return x
-    return _check_range(code, code.intrinsic("trunc", x), after) if before == "float" else _wrap(code, x, after)
+    return _check_range(code, code.intrinsic("trunc", x), after) if before == "float" else _wrap_integer(code, x, after)
 
 
 # What is done with integers, which are whole doubles.
@@ -147,10 +147,10 @@ INTEGERS = {
 def _multiply_words(kind: str, code: Code, a: Value, b: Value) -> Value:
     """A product of integers of 32 bits, less what wraps: of each half of one of them a double holds it exactly."""
     high = code.intrinsic("floor", a * 2.0**-16)
-    return _wrap(code, high * b, kind) * 2.0**16 + (a - high * 2.0**16) * b
+    return _wrap_integer(code, high * b, kind) * 2.0**16 + (a - high * 2.0**16) * b
 
 
-def _wrap(code: Code, x: Value, kind: str) -> Value:
+def _wrap_integer(code: Code, x: Value, kind: str) -> Value:
     """An integer as its type holds it: what is too large for one of up to 32 bits begins anew below."""
     low, period = float(np.iinfo(kind).min), 2.0 ** np.iinfo(kind).bits
     if period > 2.0**32:
@@ -186,7 +186,7 @@ def sincos_function(module: ir.Module, lanes: int, name: str = "sincos", rounds:
     code = Code(module, name, [ir.VectorType(DOUBLE, lanes), POINTER], lanes, rounds=rounds)
     x, address = code.arguments
     near = abs(x) <= LARGEST_ANGLE
-    sine, cosine = _polynomials(code, code.select(near, x, 0.0))
+    sine, cosine = _sincos_polynomials(code, code.select(near, x, 0.0))
     code.store(sine, address)
     code.store(cosine, code.element(address, lanes))
     # A lane must not depend on its neighbours: only the far ones are replaced.
@@ -196,7 +196,7 @@ def sincos_function(module: ir.Module, lanes: int, name: str = "sincos", rounds:
     return code.finish()
 
 
-def _polynomials(code: Code, x: Value) -> tuple[Value, Value]:
+def _sincos_polynomials(code: Code, x: Value) -> tuple[Value, Value]:
     # k times a part of π/2 is exact, so contraction into a fused multiply-add changes nothing.
     first, second, third, fourth = PI_2
     k = code.intrinsic("rint", x * (1 / PI_2_ROUNDED[0]))
@@ -207,10 +207,10 @@ def _polynomials(code: Code, x: Value) -> tuple[Value, Value]:
     head, r = r, r - k * third
     tail = tail + ((head - r) - k * third) - k * fourth
     z = r * r
-    sine = r + (r * z * _horner(z, SIN) + tail)
+    sine = r + (r * z * _evaluate_horner(z, SIN) + tail)
     half = 0.5 * z
     one_less = 1.0 - half
-    cosine = one_less + (((1.0 - one_less) - half) + (z * z * _horner(z, COS) - r * tail))
+    cosine = one_less + (((1.0 - one_less) - half) + (z * z * _evaluate_horner(z, COS) - r * tail))
     return _rotate_quarters(code, k, sine, cosine)
 
 
@@ -223,7 +223,7 @@ def _rotate_quarters(code: Code, k: Value, sine: Value, cosine: Value) -> tuple[
     return code.select(quadrant > 1.5, -s, s), code.select(middle, -c, c)
 
 
-def _horner(z, coefficients):
+def _evaluate_horner(z, coefficients):
     total = coefficients[-1]
     for coefficient in coefficients[-2::-1]:
         total = coefficient + z * total

@@ -72,12 +72,12 @@ def schedule(line: StraightLine, stored: int) -> Schedule:
     """The order of operations that outputs need, and slots of results; the last outputs are `stored` elsewhere."""
     nodes, uses = line.nodes, count_uses(line.nodes, line.outputs)
     kinds: _Kinds = {}
-    operations = _join_pairs(_operations(line, uses, kinds), uses, kinds)
+    operations = _join_pairs(_needed_operations(line, uses, kinds), uses, kinds)
     staying = len(line.outputs) - stored
-    outputs, copies = _outputs(line, operations, kinds, staying)
+    outputs, copies = _separate_outputs(line, operations, kinds, staying)
     operations += copies
     groups = _group_by_level(operations, len(nodes) + len(line.outputs))
-    slots, size = _slots(groups, outputs, staying, len(nodes))
+    slots, size = _allocate_slots(groups, outputs, staying, len(nodes))
     live = [i for i, count in enumerate(uses) if count]
     inputs = {i: nodes[i][2] for i in live if nodes[i][0] == "input"}
     constants = {i: float(nodes[i][2]) for i in live if nodes[i][0] == "constant"}
@@ -91,7 +91,7 @@ def _number(kinds: _Kinds, kind: OperationKind) -> int:
     return kinds.setdefault(kind, len(kinds))
 
 
-def _operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[ScheduledOperation]:
+def _needed_operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[ScheduledOperation]:
     """The operations that the outputs need, each after those that it reads."""
     angles: dict[int, list[int]] = {}  # the nodes of the sine and the cosine of each; -1 where one is not needed
     for i, (op, operands, _) in enumerate(line.nodes):
@@ -112,7 +112,7 @@ def _operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[Sche
     return operations
 
 
-def _outputs(
+def _separate_outputs(
     line: StraightLine, operations: list[ScheduledOperation], kinds: _Kinds, staying: int
 ) -> tuple[dict[int, int], list[ScheduledOperation]]:
     """The first outputs that nodes are, and copies for all others: that for output k of N nodes is node N + k."""
@@ -207,7 +207,7 @@ def _group_by_level(operations: list[ScheduledOperation], nodes: int) -> list[li
 # ---- slots -----------------------------------------------------------------------------------------------------------
 
 
-def _slots(
+def _allocate_slots(
     groups: list[list[ScheduledOperation]], outputs: dict[int, int], count: int, nodes: int
 ) -> tuple[dict[int, int], int]:
     """A slot for every result, the one that became free last first; inputs and constants have none here.

@@ -46,17 +46,19 @@ class LookUps:
             return self.take(frame, attribute, x)
         assert isinstance(attribute, Located)
         table, code = attribute.table, frame.code
-        base, first = self._base(frame, table)
+        base, first = self._table_base(frame, table)
         found = code.lanes_of(0.0)
-        for lane, (begin, number) in enumerate(zip(self._whole(code, first), _lanes(code, x), strict=True)):
+        for lane, (begin, number) in enumerate(zip(self._to_integers(code, first), _lane_values(code, x), strict=True)):
             constants = (code.as_value(n, INTEGER) for n in (table.stride, table.count, attribute.closed))
-            piece = code.call(self._locate, code.element(base, begin), *constants, number)
+            piece = code.call(self._locate_function, code.element(base, begin), *constants, number)
             found = _insert_lane(code, found, lane, piece)
         return found
 
     def take(self, frame: Frame, table: Table, x: Value) -> Value:
-        code, (base, first), found = frame.code, self._base(frame, table), frame.constant(0.0)
-        for lane, place in enumerate(self._whole(code, self._clip(code, table, x) * float(table.stride) + first)):
+        code, (base, first), found = frame.code, self._table_base(frame, table), frame.constant(0.0)
+        for lane, place in enumerate(
+            self._to_integers(code, self._clip_index(code, table, x) * float(table.stride) + first)
+        ):
             found = _insert_lane(code, found, lane, code.load(code.element(base, place), DOUBLE))
         return found
 
@@ -65,20 +67,20 @@ class LookUps:
         code = frame.code
         begin = code.element(frame.job("params"), first + (table.first - BESIDE))
         constants = (code.as_value(n, INTEGER) for n in (table.stride, table.count))
-        return code.call(self._increases, begin, *constants) > 0
+        return code.call(self._increases_function, begin, *constants) > 0
 
     def places(self, frame: Frame, table: Table, x: Value) -> list[Value]:
         """The places of entries with these numbers among the numbers of a member, lane by lane."""
-        x = self._clip(frame.code, table, x) * float(table.stride) + float(table.first - BESIDE)
-        return self._whole(frame.code, x)
+        x = self._clip_index(frame.code, table, x) * float(table.stride) + float(table.first - BESIDE)
+        return self._to_integers(frame.code, x)
 
     @staticmethod
-    def _clip(code: Code, table: Table, x: Value) -> Value:
+    def _clip_index(code: Code, table: Table, x: Value) -> Value:
         """A number that the table has; of what is NaN the first."""
         x, last = code.select(x > 0.0, x, 0.0), float(table.count - 1)
         return code.select(x < last, x, last)
 
-    def _base(self, frame: Frame, table: Table) -> tuple[Value, Value]:
+    def _table_base(self, frame: Frame, table: Table) -> tuple[Value, Value]:
         """The address that doubles are counted from, and the number of the first entry in every lane."""
         code = frame.code
         if table.numbers is not None:
@@ -97,7 +99,7 @@ class LookUps:
         return place
 
     @functools.cached_property
-    def _increases(self) -> Code:
+    def _increases_function(self) -> Code:
         """`(base, stride, count)`: 1 where every entry is larger than the one before it, else 0."""
         code = Code(self.module, "increases", [POINTER, INTEGER, INTEGER], 1, result=INTEGER)
         base, stride, count = code.arguments
@@ -108,7 +110,7 @@ class LookUps:
         return code.finish(found.value)
 
     @functools.cached_property
-    def _locate(self) -> Code:
+    def _locate_function(self) -> Code:
         """`(base, stride, count, closed, x)`: the number of entries that are at most x, less one."""
         code = Code(self.module, "locate", [POINTER, INTEGER, INTEGER, INTEGER, DOUBLE], 1, result=DOUBLE)
         base, stride, count, closed, x = code.arguments
@@ -124,12 +126,12 @@ class LookUps:
         return code.finish(code.as_double(code.select(ends, count - 2, found)))
 
     @staticmethod
-    def _whole(code: Code, x: Value) -> list[Value]:
+    def _to_integers(code: Code, x: Value) -> list[Value]:
         """The whole numbers in the lanes of a vector, as integers: below 2⁵³ a double is exact."""
-        return _lanes(code, Value(code, code.builder.fptosi(x.it, ir.VectorType(INTEGER, code.lanes))))
+        return _lane_values(code, Value(code, code.builder.fptosi(x.it, ir.VectorType(INTEGER, code.lanes))))
 
 
-def _lanes(code: Code, x: Value) -> list[Value]:
+def _lane_values(code: Code, x: Value) -> list[Value]:
     return [lane_of(code, x, k) for k in range(code.lanes)]
 
 

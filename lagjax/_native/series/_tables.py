@@ -38,7 +38,7 @@ class Tables:
         self._execute: Frame = function("execute", POINTER, INTEGER)
         self._prepare: Frame = function("prepare")
         self._module, self._layout = self._prepare.code.module, self._prepare.layout
-        self._nowhere = self._layout.place(self._field(1), 0)  # for unused results
+        self._nowhere = self._layout.place(self._table_field(1), 0)  # for unused results
 
     # ---- what a kernel is written with ----
 
@@ -53,9 +53,9 @@ class Tables:
         if line not in self._schedules:
             self._schedules[line] = schedule(line, 0 if to is None else len(to))
         plan = self._schedules[line]
-        name, lying = self._field(plan.size), self._places(frame, inputs)
+        name, lying = self._table_field(plan.size), self._group_places(frame, inputs)
         places = {node: self._layout.place(name, slot) for node, slot in plan.slots.items()}
-        places |= {node: self._constant(number) for node, number in plan.constants.items()}
+        places |= {node: self._table_constant(number) for node, number in plan.constants.items()}
         places |= {node: lying[position] for node, position in plan.inputs.items()}
         if to is not None:
             assert to.place is not None
@@ -65,7 +65,7 @@ class Tables:
         for group in plan.groups:
             kind = plan.kinds[group[0].kind]
             if kind.op != "store" or to is not None:
-                words += self._words(kind, group, places)
+                words += self._group_words(kind, group, places)
         table = Value(frame.code, integers(self._module, np.array([*words, 0], np.int32)))
         shift = None if to is None else to.shift
         frame.call(self._execute.code, table, frame.code.as_value(0 if shift is None else shift, INTEGER))
@@ -83,7 +83,7 @@ class Tables:
             yield [i, i + n], {1: i}
 
     def room(self, frame: Frame, count: int) -> Numbers:
-        return frame.vectors(self._field(count), count)
+        return frame.vectors(self._table_field(count), count)
 
     def largest(self, code: Code, numbers: Callable[[Value], Value], count: int) -> Value:
         """The largest of this many numbers, which are not negative; NaN where the last one is."""
@@ -122,19 +122,19 @@ class Tables:
 
     # ---- where numbers lie ----
 
-    def _field(self, count: int) -> str:
+    def _table_field(self, count: int) -> str:
         name = f"field{self._fields}"
         self._fields += 1
         self._layout.extend_by({name: count})
         return name
 
-    def _constant(self, number: float) -> int:
+    def _table_constant(self, number: float) -> int:
         key = struct.pack("d", number)  # 0.0 and -0.0 are equal but not the same
         if key not in self._constants:
-            self._constants[key] = self._layout.place(self._field(1), 0)
+            self._constants[key] = self._layout.place(self._table_field(1), 0)
         return self._constants[key]
 
-    def _places(self, frame: Frame, inputs) -> list[int]:
+    def _group_places(self, frame: Frame, inputs) -> list[int]:
         places: list[int] = []
         for values in inputs:
             if getattr(values, "place", None) is None or values.shift is not None:
@@ -147,7 +147,7 @@ class Tables:
 
     # ---- the table of a program ----
 
-    def _words(self, kind: OperationKind, group: list[ScheduledOperation], places: dict[int, int]) -> list[int]:
+    def _group_words(self, kind: OperationKind, group: list[ScheduledOperation], places: dict[int, int]) -> list[int]:
         """The words of the table for a group of operations of one kind.
 
         For as many at a time as there is code for: the number of that code, then the places of operands and results.

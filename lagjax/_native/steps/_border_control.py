@@ -41,13 +41,13 @@ class BorderControl:
         self.forgotten = {"h_before": 0.0} if returns else {}
         self.narrow = NarrowFeatures(motion, self.roots, borders.features)
         if not self.pieces:
-            self.stop = self._stop()
+            self.stop = self._end_step_at_border()
             return
         self.table = GuardTable(motion, borders)
         self.knots = Knots(motion, borders, self.table)
         self.crossing = BorderCrossing(motion, borders, self.knots, nesting, jump, self.forgotten)
         self.kicks = self.crossing.kicks
-        self.stop, self.graze = self._stop(), self._graze(nesting.base)
+        self.stop, self.graze = self._end_step_at_border(), self._find_grazing(nesting.base)
 
     @property
     def pieces(self) -> int:
@@ -98,7 +98,7 @@ class BorderControl:
         with frame.code.loop(self.pieces) as j:
             lane["stays", j], lane["params", j + self.motion.parameters] = 0.0, 0.0
 
-    def _stop(self) -> Code:
+    def _end_step_at_border(self) -> Code:
         """`(order)`: the step ends at the first border."""
         frame = self.motion.function("stop_at_border", INTEGER)
         code, (order,), h = frame.code, frame.arguments, frame["h"]
@@ -113,9 +113,9 @@ class BorderControl:
                 for border in self.table.each(frame):
                     frame.assign(border.touch >= Touch.SLIDING, slides=1)
             for border in self.table.each(frame):
-                self._look(frame, border, degree, h)
+                self._note_crossing(frame, border, degree, h)
             if self.table.groups:
-                self._join(frame, h)
+                self._join_crossings(frame, h)
         self.narrow.look(frame, degree, h)
         cut = frame["nearest"] < 1.0
         if self.pieces and self.kicks is not None:
@@ -125,7 +125,7 @@ class BorderControl:
         frame.assign(cut, last=0.0, **self.forgotten)
         return frame.finish()
 
-    def _look(self, frame: Frame, border: Border, degree: Value, h: Value) -> None:
+    def _note_crossing(self, frame: Frame, border: Border, degree: Value, h: Value) -> None:
         """Note where a guard is crossed, if that is sooner than what was noted before."""
         code, piece = frame.code, border.piece
         side, level, beyond = border.rule("side")(piece), border.level(piece), border.rule("beyond")(piece)
@@ -146,8 +146,8 @@ class BorderControl:
             tolerances = limits.SWITCH_TOLERANCES * frame.job("rtol"), absolute_tolerance(frame)
             self.roots.shorten_to(frame, degree, *tolerances, limits.RESOLVED)
             frame.call(self.roots.first_root, degree)
-            self._look_closer(frame, degree)
-            self._note_first(frame, border, h, (undecided, beyond, leads), comes, idle)
+            self._refine_early_root(frame, degree)
+            self._note_first_root(frame, border, h, (undecided, beyond, leads), comes, idle)
 
     def _limit_growth(self, frame: Frame, border: Border, level: Value) -> None:
         """The step ends where the length of a cone's vector, whose polynomial is in `poly`, has grown by a part of it.
@@ -177,7 +177,7 @@ class BorderControl:
         first = [abs(frame["poly", k]) for k in range(3)]  # the last ones may have become zero
         return (nothing & touches) | (first[0] + first[1] + first[2] < limits.TINY)
 
-    def _note_first(self, frame: Frame, border: Border, h: Value, piece: tuple, comes: Value, idle: Value) -> None:
+    def _note_first_root(self, frame: Frame, border: Border, h: Value, piece: tuple, comes: Value, idle: Value) -> None:
         """Note the root of a guard if it is the first: `beyond` it is that `piece`, or one that is `undecided`.
 
         A border that it `comes` to where another one has been met is met in a step of its own: each shifts tangents.
@@ -201,7 +201,7 @@ class BorderControl:
         frame.assign(sooner, nearest=root, at_rest=at_rest, crossed=crossed, crossed_number=code.as_double(border.g))
         frame.assign(sooner, beyond=code.select(undecided, leads, beyond))
 
-    def _join(self, frame: Frame, h: Value) -> None:
+    def _join_crossings(self, frame: Frame, h: Value) -> None:
         """Cross the first border of every group that is there at one instant with the first of all.
 
         With derivatives a border is met in a step of its own, which shifts tangents; it is crossed in no time.
@@ -232,7 +232,7 @@ class BorderControl:
                 frame.assign(at_once, border.g, joins=1)
                 frame["more"] = frame["more"] + code.flag(at_once)
 
-    def _look_closer(self, frame: Frame, degree: Value) -> None:
+    def _refine_early_root(self, frame: Frame, degree: Value) -> None:
         """A root that comes early is as exact as what lies before it allows, and not the whole step."""
         code = frame.code
 
@@ -279,7 +279,7 @@ class BorderControl:
         frame.assign(stepped, is_hit=0.0, grazes=0.0, stops=0.0)
         frame.call(self.graze)
 
-    def _graze(self, base: int) -> Code:
+    def _find_grazing(self, base: int) -> Code:
         """`()`: set `grazes` where the step ends at a border that it only grazes, and `stops` where to rounding.
 
         With the rate u̇ of its switching number a motion that is moved by the tolerance, u by ε, does not cross it, or
@@ -304,13 +304,13 @@ class BorderControl:
                     size = slope * abs(state[i + part * n])
                     rounding.value += size * limits.EPS
                     error.value += rtol * size + slope * code.lanes_of(atol)
-            rate, bend = self._rates(frame, order)
+            rate, bend = self._switching_rates(frame, order)
             is_hit = ends & (frame["is_hit"] > 0.0)
             for name, by in (("grazes", error.value), ("stops", rounding.value)):
                 frame.assign(is_hit & (rate * rate <= 2.0 * (abs(bend) * by)), **{name: 1})
         return frame.finish()
 
-    def _rates(self, frame: Frame, order: Value) -> tuple[Value, Value]:
+    def _switching_rates(self, frame: Frame, order: Value) -> tuple[Value, Value]:
         """u̇ and ü at the end of the step, of the switching number that is `hit`."""
         code, degree = frame.code, self.motion.followed_degree(frame.code, order)
         with code.loop(degree) as i:

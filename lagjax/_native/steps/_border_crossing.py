@@ -34,7 +34,7 @@ class BorderCrossing:
             knots,
             forgotten,
         )
-        self.decide = self._decide()
+        self.decide = self._decide_pieces()
         self.retraction = borders.holding.retraction and Retraction(motion, borders, nesting)
         self.retract = self.retraction and self.retraction.apply(is_run=True)
         self.jump: tuple[Code, Code] | None = None  # what notes it, and what applies it
@@ -43,9 +43,9 @@ class BorderCrossing:
             motion.layout.extend_by(saltation.fields_along())
             self.jump = saltation.note(), saltation.apply()
         self.kicks = Kicks(motion, borders, self.table, nesting.base) if borders.kicking else None
-        self.cross = self._cross()
+        self.cross = self._cross_borders()
 
-    def _decide(self) -> Code:
+    def _decide_pieces(self) -> Code:
         """`()`: the pieces of the lanes that are undecided."""
         frame = self.motion.function("decide")
         code, undecided = frame.code, frame["undecided"] > 0.0
@@ -62,11 +62,11 @@ class BorderCrossing:
             frame["undecided"] = 0.0
         return frame.finish()
 
-    def _decide_again(self, frame: Frame, where: Value) -> None:
+    def _redecide_piece(self, frame: Frame, where: Value) -> None:
         frame.assign(where, undecided=1)
         frame.call(self.decide)
 
-    def _cross(self) -> Code:
+    def _cross_borders(self) -> Code:
         """`()`: after the step, the pieces beyond the borders that were reached."""
         frame = self.motion.function("cross")
         code = frame.code
@@ -83,16 +83,16 @@ class BorderCrossing:
             if self.jump is not None:
                 frame.call(self.jump[0])
             if self.borders.holding.release.outputs:
-                self._release(frame)
+                self._release_cones(frame)
             if self.kicks is not None:
                 self.kicks.note_pieces(frame)
-            self._go_on(frame, crosses)
+            self._pass_borders(frame, crosses)
             if self.table.groups:
                 counts = stepped & self.table.crosses(frame, Crossed.GUARD)
                 frame["steps"] = frame["steps"] + code.select(counts, frame["more"], 0.0)
             frame.assign(crosses, **self.forgotten)
             if self.kicks is not None:
-                self._decide_by_velocity(frame, self.kicks.apply(frame, crosses))
+                self._redecide_kicked(frame, self.kicks.apply(frame, crosses))
             if self.jump is not None:
                 frame.call(self.jump[1])
             # A border at which a step of no length ends, too, whether it is crossed or only met.
@@ -102,25 +102,25 @@ class BorderCrossing:
             frame.assign(frame["idle_crossings"] > most, code=limits.DISCONTINUOUS)
         return frame.finish()
 
-    def _go_on(self, frame: Frame, going: Value) -> None:
+    def _pass_borders(self, frame: Frame, going: Value) -> None:
         """Go past borders and knots; the motion slides along no border that jumps there, and touches none such."""
         shaken, code = self.borders.shaken, frame.code
         line = eliminate_dead_code(self.borders.program.line, [self.borders.decisions[j].switch for j in shaken])
         before = self.motion.evaluate_now(frame, line) if shaken else []
         before = [code.variable(before[k]) for k in range(len(shaken))]
         for border in self.table.each(frame):
-            self._take_beyond(frame, border)
+            self._enter_beyond(frame, border)
         self.knots.cross(frame, going)
-        self._decide_others(frame, going)
+        self._redecide_dependents(frame, going)
         after = self.motion.evaluate_now(frame, line) if shaken else []
         for k, j in enumerate(shaken):
             jump = abs(after[k] - before[k].value)
             least = abs(after[k]) * limits.ROUND_OFF + code.lanes_of(absolute_tolerance(frame))
-            self._let_go(frame, going & (jump > least), [j])
+            self._release_borders(frame, going & (jump > least), [j])
         if shaken:
-            self._decide_others(frame, going)
+            self._redecide_dependents(frame, going)
 
-    def _let_go(self, frame: Frame, where: Value, pieces: Container[int]) -> None:
+    def _release_borders(self, frame: Frame, where: Value, pieces: Container[int]) -> None:
         """The motion touches the borders of some pieces no more, and slides along none of them."""
         for g, guard in enumerate(self.borders.guards):
             if guard.piece in pieces:
@@ -128,7 +128,7 @@ class BorderCrossing:
                 if guard.slide >= 0:
                     frame.assign(where, self.motion.parameters + guard.slide, params=0.0)
 
-    def _decide_others(self, frame: Frame, going: Value) -> None:
+    def _redecide_dependents(self, frame: Frame, going: Value) -> None:
         """Decide the pieces anew that touch no border and have left none, where one is crossed that others read."""
         if not self.borders.nested:
             return
@@ -138,9 +138,9 @@ class BorderCrossing:
             frame["stays", j] = 1.0
         for border in self.table.each(frame):
             frame.assign(frame.code.compare("!=", border.touch, float(Touch.NONE)), border["piece"], stays=1)
-        self._decide_again(frame, going)
+        self._redecide_piece(frame, going)
 
-    def _take_beyond(self, frame: Frame, border: Border) -> None:
+    def _enter_beyond(self, frame: Frame, border: Border) -> None:
         """Take the piece beyond a border, which touches it; a piece that touches one is not decided anew.
 
         A motion that would go back over the border at once is pushed onto it from both sides: it slides. So does one
@@ -167,9 +167,9 @@ class BorderCrossing:
             frame.assign(slides, slide + self.motion.parameters, params=1)
             for g, touch in ((border.g, Touch.NONE), (back, Touch.NONE), (border["rest"], Touch.SLIDING)):
                 frame.assign(slides, g, touch=touch)
-        self._leave(frame, border, hit, again)
+        self._leave_sliding(frame, border, hit, again)
 
-    def _leave(self, frame: Frame, border: Border, hit: Value, again: Value) -> None:
+    def _leave_sliding(self, frame: Frame, border: Border, hit: Value, again: Value) -> None:
         """Let a sliding motion continue on one side, when its share of that side reaches 0 or 1.
 
         The rate of u that was kept at zero is zero there after a slide, and not where it did not slide at all. Where
@@ -191,7 +191,7 @@ class BorderCrossing:
             if self.borders.releases:  # the vector of a cone has been given a length beyond its level
                 on.remember(hit & on.is_cone, touch=Touch.NONE)
 
-    def _release(self, frame: Frame) -> None:
+    def _release_cones(self, frame: Frame) -> None:
         """Let the vectors of cones that hold no longer set out, with a speed that is twice what counts as none."""
         code, motion, n = frame.code, self.motion, len(self.borders.holding.release.outputs)
         shares = self.borders.releases
@@ -208,7 +208,7 @@ class BorderCrossing:
                         frame.assign(hit, i + motion.n, 0, y=y)
                         frame.assign(hit, i + motion.n, low=0.0)
 
-    def _decide_by_velocity(self, frame: Frame, kicked: Value) -> None:
+    def _redecide_kicked(self, frame: Frame, kicked: Value) -> None:
         """Decide the pieces anew whose switching numbers depend on velocities, which have been kicked."""
         velocities = range(self.motion.n, self.motion.states)
         by_velocity = [
@@ -219,5 +219,5 @@ class BorderCrossing:
         if by_velocity:
             for j in range(self.motion.pieces):
                 frame.assign(kicked, j, stays=0.0 if j in by_velocity else 1.0)
-            self._let_go(frame, kicked, by_velocity)
-            self._decide_again(frame, kicked)
+            self._release_borders(frame, kicked, by_velocity)
+            self._redecide_piece(frame, kicked)

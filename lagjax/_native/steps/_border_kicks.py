@@ -17,7 +17,7 @@ class Kicks:
     def __init__(self, motion: TaylorSeries, borders: Borders, table: GuardTable, base: int):
         self.motion, self.borders, self.table = motion, borders, table
         self.in_time = borders.kicks_in_time(motion.states)
-        self.kick = self._kick(base)
+        self.kick = self._kick_velocities(base)
 
     @staticmethod
     def fields(pieces: int) -> Fields:
@@ -34,11 +34,11 @@ class Kicks:
 
     def settle(self, frame: Frame, stepped: Value) -> Value:
         """Note whether a step `counts`: also those of no length where a kick begins or ends them."""
-        stepped = stepped | (self.table.kicks(frame) & ~self._begins_behind(frame))
+        stepped = stepped | (self.table.kicks(frame) & ~self._begins_past_jump(frame))
         frame["counts"] = stepped | (frame["last"] > 0.0)
         return stepped
 
-    def _begins_behind(self, frame: Frame) -> Value:
+    def _begins_past_jump(self, frame: Frame) -> Value:
         """True where a motion begins at an instant at which L jumps: with the velocities behind it, in time's order."""
         begins = (frame["steps"] <= 0.0) & (frame["forward"] > 0.0)
         found = frame.constant(0.0) > 0.0
@@ -66,7 +66,7 @@ class Kicks:
             beyond = guard.beyond(border.piece)
             frame.assign(there, crossed=Crossed.GUARD, crossed_number=float(g), beyond=beyond)
 
-    def _kick(self, base: int) -> Code:
+    def _kick_velocities(self, base: int) -> Code:
         """`()`: the velocities behind the border, in the lanes that are to `kicks`; 2 there if they do not pass it."""
         frame, motion, kick = self.motion.function("kick"), self.motion, self.borders.kick
         assert kick is not None

@@ -48,10 +48,10 @@ class Events:
         self.can_jump = any(piecewise)
         rows = list(zip(guards.directions, piecewise, holds, strict=False))
         self.table = Columns(motion.module, ("direction", "piecewise", "holds"), rows)
-        self.guard = self._guard()
+        self.guard = self._evaluate_guards()
         self.begin_sides = self._begin_sides()
-        self.note = self._note(output) if guards.notes else None
-        self.look = self._look()
+        self.note = self._write_change(output) if guards.notes else None
+        self.look = self._find_changes()
 
     @staticmethod
     def fields(guards: int) -> Fields:
@@ -76,7 +76,7 @@ class Events:
 
     # ---- the guards ----
 
-    def _guard(self) -> Code:
+    def _evaluate_guards(self) -> Code:
         """`(order, s)`: the guards at that time after the present one, lane by lane, into `guard`."""
         frame = self.motion.function("guard", INTEGER, self.motion.vector)
         order, s = frame.arguments
@@ -127,9 +127,9 @@ class Events:
             frame.constant(0.0) if self.guards.notes else 0.0 - direction
         )  # from where it can change in its direction
         if self.guards.remembers:
-            before, rate_noise = self._noted(watch)
+            before, rate_noise = self._noted_numbers(watch)
         of_rate = abs(frame["h"]) * rate_noise
-        lead, order_of_zero = self._lead(watch, order, limits.GUARD_NOISE * size + of_rate)
+        lead, order_of_zero = self._leading_term(watch, order, limits.GUARD_NOISE * size + of_rate)
         away, from_there, moved = (abs(x) for x in (value, before, rate))
         on_it = away <= noise + moved * (limits.INSTANT * frame["smallest"])
         if self.guards.remembers:
@@ -139,7 +139,7 @@ class Events:
         leaves, sound = moved > rate_noise, order_of_zero > 0.0
         turn = code.select(sound, lead, later - value)
         bends = abs(turn) > code.select(sound, 0.0, noise)
-        before = self._sign(frame, before)
+        before = self._sign_of(frame, before)
         unclear = code.select(code.compare("!=", before, 0.0), 0.0, turn if is_rounded else later)
         going = code.select(leaves, rate * frame["forward"], code.select(bends, turn, unclear))
         there = on_it | (value * before < 0.0) if self.guards.remembers else on_it
@@ -150,24 +150,24 @@ class Events:
         frame["met", g] = code.select(met, code.select(before > 0.0, Change.FALLS, Change.RISES), 0.0)
         side = code.select(on_it, code.select(met | code.compare("==", going, 0.0), before, going), value)
         zeros = code.select(leaves, Touch.VALUE, code.select(sound, order_of_zero, Touch.RATE))
-        watch.remember(fresh, side=self._sign(frame, side), contact=code.select(on_it, zeros, Touch.NONE))
+        watch.remember(fresh, side=self._sign_of(frame, side), contact=code.select(on_it, zeros, Touch.NONE))
         if is_rounded:
             watch.remember(fresh, zero=code.select(on_it, value, 0.0))
 
-    def _noted(self, watch: Watch) -> tuple[Value, Value]:
+    def _noted_numbers(self, watch: Watch) -> tuple[Value, Value]:
         """The two numbers of a guard that a motion `remembers`."""
         first = self.motion.parameters + watch.g - 2 * self.count
         return watch.frame["params", first], watch.frame["params", first + self.count]
 
-    def _noise(self, watch: Watch) -> Value:
+    def _guard_noise(self, watch: Watch) -> Value:
         """The rounding of a guard: that of now or, in a motion that remembers, the largest one so far."""
         noise = limits.GUARD_NOISE * watch.recall("kept")
         if not self.guards.remembers:
             return noise
-        noted = abs(self._noted(watch)[0])
+        noted = abs(self._noted_numbers(watch)[0])
         return watch.code.select((noted > noise) & (noted < float("inf")), noted, noise)
 
-    def _lead(self, watch: Watch, order: Value, noise: Value) -> tuple[Value, Value]:
+    def _leading_term(self, watch: Watch, order: Value, noise: Value) -> tuple[Value, Value]:
         """The first term of a guard behind its rate that is more than noise, and its order, for a whole step.
 
         The order is one more than the last one where all terms are rounding, and 0 where there is no series.
@@ -186,7 +186,7 @@ class Events:
             at.value = code.select(is_first, code.lanes_of(code.as_number(k)), at.value)
         return lead.value, at.value
 
-    def _sign(self, frame: Frame, x: Value) -> Value:
+    def _sign_of(self, frame: Frame, x: Value) -> Value:
         code = frame.code
         return code.select(x > 0.0, 1, code.select(x < 0.0, -1, 0.0))
 
@@ -223,15 +223,15 @@ class Events:
         frame["event"] = frame.code.select(happens, frame.constant(0.0), -1.0)
         frame.assign(happens, last=0.0, h=frame["first_at"] * frame["forward"])
 
-    def _look(self) -> Code:
+    def _find_changes(self) -> Code:
         """`(order)`: the changes of all guards along the step."""
         frame = self.motion.function("look_at_guards", INTEGER)
         frame["seen"], frame["first_at"] = 1.0, float("inf")
         for watch in self.table.each(frame):
-            self._look_at(watch, *frame.arguments)
+            self._find_guard_change(watch, *frame.arguments)
         return frame.finish()
 
-    def _look_at(self, watch: Watch, order: Value) -> None:
+    def _find_guard_change(self, watch: Watch, order: Value) -> None:
         frame, code, g, h = watch.frame, watch.code, watch.g, watch.frame["h"]
         met, side = watch.recall("met"), watch.recall("side")
         moving, happened = code.compare("!=", h, 0.0), met > 0.0
@@ -240,14 +240,14 @@ class Events:
         frame["side_end", g], frame["noted_end", g] = side, frame["noted", g]
         frame["contact_end", g] = code.select(moving, Touch.NONE, frame["contact", g])
         degree, j, zero = self.motion.followed_degree(code, order), g + self.first, frame["zero", g]
-        here = self._sign(frame, self.motion.followed_value(frame, j) - zero)
+        here = self._sign_of(frame, self.motion.followed_value(frame, j) - zero)
         side = code.select(code.compare("==", side, 0.0), here, side)
         self.roots.polynomial(frame, j, degree, h, side, zero)
         moving = moving & ~happened
-        with code.only_if(code.any_lane(moving & ~self._is_clear(watch, degree))):
-            self._look_closely(watch, order, degree, side, moving)
+        with code.only_if(code.any_lane(moving & ~self._has_no_root(watch, degree))):
+            self._search_roots(watch, order, degree, side, moving)
 
-    def _is_clear(self, watch: Watch, degree: Value) -> Value:
+    def _has_no_root(self, watch: Watch, degree: Value) -> Value:
         """The lanes whose polynomial has no root, as its coefficients alone tell; most often that is all."""
         frame, code, zero = watch.frame, watch.code, watch.frame.constant(0.0)
         falls, rises = code.variable(zero), code.variable(zero)
@@ -259,20 +259,20 @@ class Events:
         start, falls, rises = frame["poly", 0], falls.value, rises.value
         last, before = (self.roots.last_terms(frame, degree, first) for first in (0, 3))
         size = start + falls + rises
-        return (start > falls + last) & ~self._is_long(watch, last, before, size)
+        return (start > falls + last) & ~self._is_inaccurate(watch, last, before, size)
 
-    def _look_closely(self, watch: Watch, order: Value, degree: Value, side: Value, moving: Value) -> None:
+    def _search_roots(self, watch: Watch, order: Value, degree: Value, side: Value, moving: Value) -> None:
         frame, code, roots, h = watch.frame, watch.code, self.roots, watch.frame["h"]
         size, contact, start = roots.size(frame, degree), watch.recall("contact"), frame["poly", 0]
         unknown = moving & ~(abs(start) < float("inf"))
         frame.assign(unknown, code=float(limits.NOT_FINITE), last=0.0, h=0.0)
         sound, moving = size < float("inf"), moving & ~unknown
         if self.guards.remembers:  # what stays zero to rounding, as between bodies at rest, does not fall
-            moving = moving & ~(size <= self._noise(watch))
+            moving = moving & ~(size <= self._guard_noise(watch))
 
         def is_long():
             last, before = (roots.last_terms(frame, degree, first) for first in (0, 3))
-            return self._is_long(watch, last, before, roots.size(frame, degree))
+            return self._is_inaccurate(watch, last, before, roots.size(frame, degree))
 
         roots.shorten(frame, degree, is_long)
         frame["doubt"], frame["begin"], frame["closer"] = roots.last_terms(frame, degree), 0.0, 1.0
@@ -290,13 +290,13 @@ class Events:
         self._bisect_change(watch, order, ahead, moving & ~sound)
         watch.remember(moving, side_end=ahead.value)
 
-    def _is_long(self, watch: Watch, last: Value, before: Value, size: Value) -> Value:
+    def _is_inaccurate(self, watch: Watch, last: Value, before: Value, size: Value) -> Value:
         """The lanes whose last terms are large, or do not fall: the polynomial may leave out as much as they are.
 
         Not where that is less than the rounding of the guard, as of one that leaves zero with a high power.
         """
         is_long = (last > limits.GUARD_TERMS * size) | ((last > limits.FALL * before) & (last > limits.SEEN * size))
-        return is_long & ~(last <= self._noise(watch))
+        return is_long & ~(last <= self._guard_noise(watch))
 
     def _follow_roots(self, watch: Watch, order: Value, degree: Value, ahead: Variable, where: Value) -> None:
         """The roots of the polynomial, one after the other, as long as none ends the motion."""
@@ -310,25 +310,25 @@ class Events:
             frame.call(self.roots.next_root, degree)
             root = frame["root"]
             is_root = searching() & self.roots.is_found(frame)
-            self._see(frame, searching() & ~is_root, self.roots.place(frame, 1.0))
-            waits = is_root & self._waits(watch)
+            self._limit_sight(frame, searching() & ~is_root, self.roots.place(frame, 1.0))
+            waits = is_root & self._ends_at_border(watch)
             watch.remember(waits, contact_end=Touch.CONTINUES)
             changes = is_root & ~waits
             with code.only_if(code.any_lane(changes)):
-                s = self._exact(watch, order, changes, ahead.value)
+                s = self._refine_root(watch, order, changes, ahead.value)
                 inside = abs(s) <= abs(frame["h"])  # else of the next step
-                goes_on = self._take(watch, order, changes & inside, s, ahead)
+                goes_on = self._take_changes(watch, order, changes & inside, s, ahead)
                 self.roots.turn(frame, degree, goes_on)
                 frame.assign(goes_on, begin=root)
                 looking.value = code.flag(goes_on)
             looking.value = code.select(changes, looking.value, 0.0)
-        self._see(frame, searching(), frame["begin"] * frame["part"])
+        self._limit_sight(frame, searching(), frame["begin"] * frame["part"])
 
-    def _see(self, frame: Frame, where: Value, seen: Value) -> None:
+    def _limit_sight(self, frame: Frame, where: Value, seen: Value) -> None:
         """Note, in some lanes, that a guard is seen only up to a fraction of the step."""
         frame.assign(where & (seen < frame["seen"]), seen=seen)
 
-    def _waits(self, watch: Watch) -> Value:
+    def _ends_at_border(self, watch: Watch) -> Value:
         """True if the next step decides what a guard does: this step ends at the guard's own border."""
         frame = watch.frame
         if not self.can_jump:
@@ -338,7 +338,7 @@ class Events:
         at_border = at_border & (frame["root"] > 0.0)  # else it has jumped already
         return (left <= 8.0 * frame["error"]) & at_border & (watch.number("piecewise") > 0.0)
 
-    def _exact(self, watch: Watch, order: Value, where: Value, side: Value) -> Value:
+    def _refine_root(self, watch: Watch, order: Value, where: Value, side: Value) -> Value:
         """The time of a root, by Newton's steps on the guard itself; a root at 0 is where it has jumped."""
         frame, code, root = watch.frame, watch.code, watch.frame["root"]
         scale = frame["part"] * frame["h"]
@@ -365,7 +365,7 @@ class Events:
         lost = (watch.recall("contact") > 0.0) & (abs(at) <= 0.25 * limits.INSTANT * frame["smallest"])
         return code.select(lost, 0.0, at)  # time does not move
 
-    def _take(self, watch: Watch, order: Value, changes: Value, s: Value, ahead: Variable) -> Value:
+    def _take_changes(self, watch: Watch, order: Value, changes: Value, s: Value, ahead: Variable) -> Value:
         """Changes at the times s: the event, or a note, where the direction is right; which lanes continue."""
         frame, code, side, size = watch.frame, watch.code, ahead.value, abs(s)
         counts = changes & ~(side * watch.number("direction") > 0.0)
@@ -388,7 +388,7 @@ class Events:
         """A part of the step, at whose end the guard is looked at; a change before that is found by bisection."""
         frame, code, side, h = watch.frame, watch.code, ahead.value, watch.frame["h"]
         with code.only_if(code.any_lane(where)):
-            self._see(frame, where, frame.constant(limits.WITHOUT_SERIES))
+            self._limit_sight(frame, where, frame.constant(limits.WITHOUT_SERIES))
             changes = where & (side * self._guard_value(watch, order, h) < 0.0)
             low, high = code.variable(frame.constant(0.0)), code.variable(h)
             with code.loop(limits.BISECTIONS):
@@ -396,11 +396,11 @@ class Events:
                 same = side * self._guard_value(watch, order, middle) > 0.0
                 for end, here in ((low, same), (high, ~same)):
                     end.value = code.select(here, middle, end.value)
-            self._take(watch, order, changes, high.value, ahead)
+            self._take_changes(watch, order, changes, high.value, ahead)
 
     # ---- what is noted ----
 
-    def _note(self, output: Output) -> Code:
+    def _write_change(self, output: Output) -> Code:
         """`(order, g, s)`: write down a change of guard g and the state there, in the lanes that are due."""
         frame = self.motion.function("note_change", INTEGER, INTEGER, self.motion.vector)
         code, (order, g, s) = frame.code, frame.arguments
@@ -412,7 +412,7 @@ class Events:
                 number = lane["noted_end", g]
                 lane["noted_end", g] = number + 1.0
                 with code.only_if(number < code.as_double(frame.job("room_of_notes"))):
-                    row = self._row(frame, lane["member"], g, code.as_integer(number))
+                    row = self._note_row(frame, lane["member"], g, code.as_integer(number))
                     frame.write("path", row, lane["reached"])
                     for i in self.motion.form.each(code, self.motion.states):
                         frame.write("path", row + 1 + i, lane["between", i])
@@ -422,11 +422,11 @@ class Events:
         """Write how each guard changes at the end of a member; or, behind its notes, how many there were."""
         with frame.code.loop(self.count) as g:
             if self.guards.notes:
-                row = self._row(frame, lane["member"], g, frame.job("room_of_notes"))
+                row = self._note_row(frame, lane["member"], g, frame.job("room_of_notes"))
                 frame.write("path", row, lane["noted", g])
             else:
                 frame.write("changes", lane["member"] * self.count + g, lane["change", g])
 
-    def _row(self, frame: Frame, member: Value, g: Value, number: Value) -> Value:
+    def _note_row(self, frame: Frame, member: Value, g: Value, number: Value) -> Value:
         rows = frame.job("room_of_notes") + 1
         return ((member * self.count + g) * rows + number) * (self.motion.states + 1)

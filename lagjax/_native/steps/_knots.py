@@ -18,15 +18,15 @@ class Knots:
         """End the step at the first knot of all."""
         clocks = sorted(enumerate(self.borders.clocks), key=lambda clock: clock[1] not in self.borders.kicking)
         for c, j in clocks:
-            self._look_at(frame, c, j, h)
+            self._end_at_knot(frame, c, j, h)
         if self.table.movable and len(clocks) > 1:
             self._note_coincidence(frame, h)
 
     def cross(self, frame: Frame, going: Value) -> None:
         """Pass all knots that are at this instant."""
         for j in self.borders.clocks:
-            left, inside = self._time_left(frame, j)
-            passes = going & inside & (left <= self._instant(frame))
+            left, inside = self._time_to_knot(frame, j)
+            passes = going & inside & (left <= self._instant_tolerance(frame))
             frame.assign(passes, self.motion.parameters + j, params=self.table.piece(frame, j) + frame["forward"])
 
     def entry(self, frame: Frame, j: int, index: Value) -> tuple[Value, Value]:
@@ -36,20 +36,20 @@ class Knots:
         inside = (index >= 0.0) & (index <= float(located.table.count - 1))
         return self.motion.look_up.take(frame, located.table, index), inside
 
-    def _time_left(self, frame: Frame, j: int) -> tuple[Value, Value]:
+    def _time_to_knot(self, frame: Frame, j: int) -> tuple[Value, Value]:
         """The time to the next entry of the table that the time is on, and the lanes where there is one."""
         code, forward = frame.code, frame["forward"]
         knot, inside = self.entry(frame, j, self.table.piece(frame, j) + code.flag(forward > 0.0))
         return ((knot - frame["t"]) - frame["t_low"]) * forward, inside
 
-    def _look_at(self, frame: Frame, c: int, j: int, h: Value) -> None:
+    def _end_at_knot(self, frame: Frame, c: int, j: int, h: Value) -> None:
         """End the step at the next entry of the table of piece j, which is clock number c."""
         code = frame.code
-        left, inside = self._time_left(frame, j)
+        left, inside = self._time_to_knot(frame, j)
         left, size = code.maximum(left, frame.constant(0.0)), abs(h)
         nearest = frame["nearest"] * size
         if self.borders.kicking and j not in self.borders.kicking:  # of several at one instant a kick counts
-            nearest = nearest - self._instant(frame)
+            nearest = nearest - self._instant_tolerance(frame)
         sooner = inside & (left < nearest)
         if j in self.borders.kicking:  # also at the end of the motion, where the velocities are those behind it
             located = self.borders.decisions[j].table
@@ -64,13 +64,13 @@ class Knots:
         code, end = frame.code, frame["nearest"] * abs(h)
         count, moves = frame.constant(0.0), frame.constant(0.0)
         for j in self.borders.clocks:
-            left, inside = self._time_left(frame, j)
-            at_once = inside & (frame["crossed"] > 0.0) & (abs(left - end) <= self._instant(frame))
+            left, inside = self._time_to_knot(frame, j)
+            at_once = inside & (frame["crossed"] > 0.0) & (abs(left - end) <= self._instant_tolerance(frame))
             count = count + code.flag(at_once)
             if j in self.table.movable:
                 moves = moves + code.flag(at_once)
         frame.assign((count > 1.0) & (moves > 0.0), crossed=Crossed.KNOTS)
 
-    def _instant(self, frame: Frame) -> Value:
+    def _instant_tolerance(self, frame: Frame) -> Value:
         """The largest difference of two times that count as the same."""
         return frame.code.maximum(abs(frame["t"]), frame["smallest"]) * (4.0 * limits.EPS)

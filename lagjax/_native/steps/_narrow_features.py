@@ -24,14 +24,14 @@ class NarrowFeatures:
         for feature, row in itertools.groupby(self.features):  # which shares its code: as of a chain's bonds
             end = first + len(list(row))
             with frame.code.loop(integer(frame.code, end), start=first) as i:
-                self._look_ahead(frame, i + self.motion.pieces, feature, degree, h)
+                self._limit_step(frame, i + self.motion.pieces, feature, degree, h)
             first = end
         frame["approach"] = frame["next_approach"]
 
-    def _look_ahead(self, frame: Frame, j: Value, feature: Feature, degree: Value, h: Value) -> None:
+    def _limit_step(self, frame: Frame, j: Value, feature: Feature, degree: Value, h: Value) -> None:
         """The step ends where the argument of a feature, number j, has come as near as one step may bring it."""
         code = frame.code
-        moves, last = self._moves(frame, j, degree, h)
+        moves, last = self._argument_change(frame, j, degree, h)
         rise = code.lanes_of(code.as_double(degree)) * (limits.RISE / feature.scale)
         near = ~((moves < rise) & (last < limits.ARGUMENT))
         if feature.kind == FALLS:
@@ -44,7 +44,7 @@ class NarrowFeatures:
         with code.only_if(code.any_lane(near)):
             self._find_feature(frame, j, feature, degree, h)
 
-    def _moves(self, frame: Frame, j: Value, degree: Value, h: Value) -> tuple[Value, Value]:
+    def _argument_change(self, frame: Frame, j: Value, degree: Value, h: Value) -> tuple[Value, Value]:
         """The largest change of a number along the step, Σ |cₖ| for k > 0, and the last of these terms."""
         code, size, sum = frame.code, abs(h), frame.constant(0.0)
 

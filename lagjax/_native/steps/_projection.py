@@ -22,7 +22,7 @@ class Projector:
     def __init__(self, motion: TaylorSeries, state: Recurrent, velocity_scale: Recurrent, base_size: int):
         self.motion, self.base_size = motion, base_size
         self.state, self.velocity_scale = state.line, velocity_scale.line
-        self.project = self._project()
+        self.project = self._project_end()
 
     @staticmethod
     def fields(n: int) -> Fields:
@@ -54,7 +54,7 @@ class Projector:
             farthest.value = code.largest_or_nan(farthest.value, error)
         return projected, farthest.value
 
-    def _project(self) -> Code:
+    def _project_end(self) -> Code:
         """`()`: the end of the step back on the constraints, into `projected`; how far it was, into `defect`."""
         frame = self.motion.function("project")
         code, states, form, h = frame.code, self.motion.states, self.motion.form, frame["h"]

@@ -42,7 +42,7 @@ class Retraction:
             "at_limit": self.base,  # 1 for a coordinate that a border moves which holds no more than it does; of these
         })  # fmt: skip
 
-    def _slides(self, code: Code, numbers: Numbers) -> Value:
+    def _is_sliding(self, code: Code, numbers: Numbers) -> Value:
         most, first = code.variable(code.lanes_of(0.0)), self.motion.parameters + self.shares[0]
         for k in self.motion.form.each(code, len(self.shares)):
             most.value = code.maximum(most.value, numbers(k + first))
@@ -57,7 +57,7 @@ class Retraction:
         code = frame.code
         for i in form.each(code, motion.states):
             frame["unretracted", i] = frame["y", i]
-        slides = self._slides(code, lambda i: frame["params", i])
+        slides = self._is_sliding(code, lambda i: frame["params", i])
         with code.only_if(code.any_lane(slides)):
             out = motion.evaluate_now(frame, self.line)
             for i in form.each(code, motion.states):
@@ -68,9 +68,9 @@ class Retraction:
                         frame["low", i] = 0.0
             if is_run and len(self.nesting.directions) > 1:
                 begins = slides & code.compare("==", frame["steps"], 0.0)
-                moves_of = self._moves_of(code, form, [(lambda i: frame["unretracted", i], lambda i: frame["y", i])])
+                moves_of = self._row_moves(code, form, [(lambda i: frame["unretracted", i], lambda i: frame["y", i])])
                 for row, a, b in self.nesting.disjoint_rows:
-                    self._lose(frame, form, "y", row, begins & moves_of(a)[0] & moves_of(b)[0])
+                    self._set_nan(frame, form, "y", row, begins & moves_of(a)[0] & moves_of(b)[0])
         return frame.finish()
 
     def undo(self, frame: Frame, where: Value) -> None:
@@ -105,7 +105,7 @@ class Retraction:
         states, form, code = directions.states, directions.form, frame.code
         line = pushforward(self.line, self.dtypes, directions.varied, range(states))
         params = directions.numbers_of(frame, "params", self.motion.numbers)
-        slides = self._slides(code, lambda i: params[i])
+        slides = self._is_sliding(code, lambda i: params[i])
         with code.only_if(code.any_lane(slides)):
             state = directions.numbers_of(frame, "unretracted", states, in_place=True)
             tangents = frame.vectors("dy", states, lambda i: (i, 0))
@@ -117,15 +117,15 @@ class Retraction:
             with code.only_if(code.any_lane(begins)):
                 retracted = directions.numbers_of(frame, "y", states, lambda i: (i, 0), in_place=True)
                 both = (state.read, retracted.read), (tangents.read, lambda i: frame["end", i])
-                moves_of, first = self._moves_of(code, form, both), self.rows
+                moves_of, first = self._row_moves(code, form, both), self.rows
                 for row in range(self.rows):
                     leaves, moved = moves_of(first + row)
-                    self._lose(
+                    self._set_nan(
                         frame, form, "end", row, begins & leaves, lambda i, moved=moved: moved(i) & (limits[i] > 0.0)
                     )
                 for row, a, b in self.nesting.with_tangents(1).disjoint_rows:
                     if row >= first:
-                        self._lose(frame, form, "end", row - first, begins & moves_of(a)[0] & moves_of(b)[0])
+                        self._set_nan(frame, form, "end", row - first, begins & moves_of(a)[0] & moves_of(b)[0])
             with frame.where(slides):
                 for i in form.each(code, states):
                     frame["dy", i, 0] = frame["end", i]
@@ -137,7 +137,7 @@ class Retraction:
         motion.layout.extend_by({"lost": motion.states})  # 1 for a number whose derivative does not exist
         frame = motion.function("back_retraction")
         code = frame.code
-        slides = self._slides(code, lambda i: frame["params", i])
+        slides = self._is_sliding(code, lambda i: frame["params", i])
         begins = slides & (frame["begins"] > 0.0)
         _, t, params = motion.state_inputs(frame)
         state, state_ct, lost = (frame.vectors(x, motion.states) for x in ("unretracted", "state_ct", "lost"))
@@ -167,17 +167,17 @@ class Retraction:
     def _find_lost(self, frame: Frame, begins: Value) -> None:
         """Set `lost` to 1 for velocities that have a cotangent which a direction off a border would need."""
         code, form = frame.code, self.motion.form
-        moves_of = self._moves_of(code, form, [(lambda i: frame["unretracted", i], lambda i: frame["y", i])])
+        moves_of = self._row_moves(code, form, [(lambda i: frame["unretracted", i], lambda i: frame["y", i])])
 
         def is_wanted(row: int, i: Index) -> Value:
-            parts = [frame["state_ct", self._place(row, i, part)] for part in range(2)]
+            parts = [frame["state_ct", self._state_place(row, i, part)] for part in range(2)]
             return ~(abs(parts[0]) + abs(parts[1]) <= 0.0)
 
         for i in form.each(code, self.motion.states):
             frame["lost", i] = 0.0
         for row in range(self.rows):
             for i in form.each(code, self.base):
-                frame["lost", self._place(row, i, 1)] = begins & (frame["at_limit", i] > 0.0) & is_wanted(row, i)
+                frame["lost", self._state_place(row, i, 1)] = begins & (frame["at_limit", i] > 0.0) & is_wanted(row, i)
         for row, a, b in self.nesting.with_tangents(1).disjoint_rows:
             if a < self.rows <= b:
                 wanted = code.variable(frame.constant(0.0))
@@ -185,15 +185,15 @@ class Retraction:
                     wanted.value = code.maximum(wanted.value, code.flag(is_wanted(row - self.rows, i)))
                 for i in form.each(code, self.base):
                     with frame.where(begins & moves_of(a)[0] & (wanted.value > 0.0)):
-                        frame["lost", self._place(b - self.rows, i, 1)] = 1
+                        frame["lost", self._state_place(b - self.rows, i, 1)] = 1
 
     # ---- where there is no derivative ----
 
-    def _place(self, row: int, i: Index, part: int) -> Index:
+    def _state_place(self, row: int, i: Index, part: int) -> Index:
         """The place of coordinate i of a row, or of its velocity (part 1), in a state."""
         return i + (part * self.motion.n + row * self.base)
 
-    def _moves_of(self, code: Code, form, states: Sequence[tuple[Numbers, Numbers]]) -> Callable:
+    def _row_moves(self, code: Code, form, states: Sequence[tuple[Numbers, Numbers]]) -> Callable:
         """`(row)`: whether a row moves by more than rounding, as its direction leaves a border; and `(i)`: what of it.
 
         The first rows are those of the first pair of states, before and after, and so on.
@@ -205,12 +205,12 @@ class Retraction:
             sums = [code.variable(code.lanes_of(0.0)) for _ in range(2)]
             for part in range(2):
                 for i in form.each(code, self.base):
-                    place = self._place(row, i, part)
+                    place = self._state_place(row, i, part)
                     sums[0].value += abs(before(place))
                     sums[1].value += abs(after(place) - before(place))
 
             def moved(i: Index) -> Value:
-                places = [self._place(row, i, part) for part in range(2)]
+                places = [self._state_place(row, i, part) for part in range(2)]
                 differs = [code.compare("!=", after(place), before(place)) for place in places]
                 return differs[0] | differs[1]
 
@@ -218,9 +218,9 @@ class Retraction:
 
         return moves_of
 
-    def _lose(self, frame: Frame, form, name: str, row: int, where: Value, which: Callable | None = None) -> None:
+    def _set_nan(self, frame: Frame, form, name: str, row: int, where: Value, which: Callable | None = None) -> None:
         """NaN in a row of a field, for the coordinates `which` or all."""
         for i in form.each(frame.code, self.base):
             with frame.where(where if which is None else where & which(i)):
                 for part in range(2):
-                    frame[name, self._place(row, i, part)] = float("nan")
+                    frame[name, self._state_place(row, i, part)] = float("nan")

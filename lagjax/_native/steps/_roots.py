@@ -193,10 +193,10 @@ class Roots:
         frame["root"], frame["is_root"] = 2.0, 1.0
         searching = ~(start > falls + frame["doubt"]) & ((falls > 0.0) | (start < 0.0)) & (frame["begin"] < 1.0)
         with code.only_if(code.any_lane(searching)):
-            self._march(frame, degree, searching)
+            self._march_to_root(frame, degree, searching)
         return frame.finish()
 
-    def _march(self, frame: Frame, degree: Value, searching: Value) -> None:
+    def _march_to_root(self, frame: Frame, degree: Value, searching: Value) -> None:
         """March to the first root from `begin` on, by the bounds `down` of −P″ and `up` of P″."""
         code, down = frame.code, frame["down"]
         bend = code.maximum(down, frame["up"])
@@ -210,7 +210,7 @@ class Roots:
         with code.repeat_while(lambda: code.any_lane(active()), at_most=MOST_MOVES):
             here, now = x.value, active()
             value, slope = self.value_and_slope(frame, degree, here)
-            noise, left_out = at_start + along * here, frame["doubt"] * self._power(here)
+            noise, left_out = at_start + along * here, frame["doubt"] * self._eighth_power(here)
             error = noise + left_out
             # A slope that what is not known, and the bend, cannot undo.
             near, steep = value <= error, slope * slope > 4.0 * (bend * error)
@@ -226,7 +226,7 @@ class Roots:
             denominator = code.select(rising, down, root - slope)
             after = code.variable(here + numerator / denominator)
             with code.only_if(code.any_lane(open)):
-                after.value = code.select(open, here + self._hop(frame, error, bend), after.value)
+                after.value = code.select(open, here + self._rounding_distance(frame, error, bend), after.value)
             x.value = code.select(now, after.value, here)
             going.value = code.flag(now & ~ends & (after.value < 1.0))
         frame.assign(active(), is_root=0.0, root=x.value)
@@ -234,17 +234,17 @@ class Roots:
     def _note_root(self, frame: Frame, here: Value, known: tuple[Value, ...], is_root: Value, ends: Value) -> None:
         """The place of a root, or where the search ends; near it one step of Newton's more, and not a long one."""
         code, (value, slope, error, bend) = frame.code, known
-        hop, back = self._hop(frame, error, bend), value / slope
+        hop, back = self._rounding_distance(frame, error, bend), value / slope
         back = code.select((slope < 0.0) & (here > frame["begin"]), code.select(back < hop, back, hop), 0.0)
         place = code.select(is_root, code.maximum(here - back, frame["begin"]), here)
         frame.assign(ends, root=place, is_root=is_root, slope=slope, error=error)
 
-    def _hop(self, frame: Frame, error: Value, bend: Value) -> Value:
+    def _rounding_distance(self, frame: Frame, error: Value, bend: Value) -> Value:
         """The distance on which P, from zero, cannot exceed its error by its bend alone."""
         code = frame.code
         return code.maximum(code.intrinsic("sqrt", 2.0 * error / bend), frame["instant"])
 
-    def _power(self, x: Value) -> Value:
+    def _eighth_power(self, x: Value) -> Value:
         """x⁸, which bounds the power after the last one of any order."""
         square = x * x
         return (square * square) * (square * square)

@@ -43,7 +43,7 @@ class Saltation:
 
     # ---- what jumps ----
 
-    def _what_jumps(
+    def _find_jumping_tangents(
         self, frame: Frame, form, hit: Vectors, pieces: Numbers, before: Numbers, behind: Numbers, grazes: Value
     ) -> tuple[Callable, Value]:
         """`(i, part)`: true if the first tangents of coordinate i (part 0), or of its velocity, jump at what is `hit`.
@@ -74,7 +74,7 @@ class Saltation:
 
         return jumps, lost
 
-    def _each(self, frame: Frame, form, rows: range) -> Iterator[tuple[int, Index, int, Index]]:
+    def _row_places(self, frame: Frame, form, rows: range) -> Iterator[tuple[int, Index, int, Index]]:
         """Row, coordinate, part (1 for its velocity) and place in the state of all numbers of some rows."""
         for row in rows:
             for part in range(2):
@@ -86,8 +86,8 @@ class Saltation:
     ) -> Callable:
         """`(row, i, part)`: the number that is added to coordinate i of a row (part 0), or to its velocity (part 1)."""
         code, n, first = frame.code, self.base, (len(self.jump.orders) - 1) * 2 * self.base
-        before, behind = (_some(out, first + k * n, n) for k in range(2))
-        jumps, lost = self._what_jumps(frame, form, hit, pieces, before, behind, grazes)
+        before, behind = (_select_numbers(out, first + k * n, n) for k in range(2))
+        jumps, lost = self._find_jumping_tangents(frame, form, hit, pieces, before, behind, grazes)
         jump_or_nan = self._jump_or_nan(code, is_hit, (grazes > 0.0) | lost)
 
         def added(row: int, i: Index, part: int) -> Value:
@@ -125,16 +125,16 @@ class Saltation:
         with code.only_if(code.any_lane(is_hit)):
             lower, numbers = self.jump.lower * base, self.jump.lower * self.parameters
             parts = [
-                _field(frame, "edge", lower), _field(frame, "edge", lower, n), frame.vectors("t", 1),
-                _field(frame, "params", numbers), frame.vectors("pieces_before", self.pieces),
-                _field(frame, "params", self.pieces, motion.parameters), *self._choice(frame.vectors),
-                _field(frame, "edge", n - lower, lower), _field(frame, "edge", n - lower, n + lower),
-                _field(frame, "params", motion.parameters - numbers, numbers),
+                _frame_vectors(frame, "edge", lower), _frame_vectors(frame, "edge", lower, n), frame.vectors("t", 1),
+                _frame_vectors(frame, "params", numbers), frame.vectors("pieces_before", self.pieces),
+                _frame_vectors(frame, "params", self.pieces, motion.parameters), *self._switching_choice(frame.vectors),
+                _frame_vectors(frame, "edge", n - lower, lower), _frame_vectors(frame, "edge", n - lower, n + lower),
+                _frame_vectors(frame, "params", motion.parameters - numbers, numbers),
             ]  # fmt: skip
             out = motion.form.run(frame, self.jump.line, *parts)
             hit = frame.vectors("hit", self.pieces)
             added = self._tangent_jumps(frame, motion.form, out, hit, parts[5], frame["is_hit"], frame["grazes"])
-            for row, i, part, place in self._each(frame, motion.form, range(1, len(self.jump.orders))):
+            for row, i, part, place in self._row_places(frame, motion.form, range(1, len(self.jump.orders))):
                 frame.assign(is_hit, place, y=frame["edge", place] + added(row, i, part))
         return frame.finish()
 
@@ -161,7 +161,7 @@ class Saltation:
             self._note_edge(frame)
         return frame.finish()
 
-    def _choice(self, numbers: Callable) -> list:
+    def _switching_choice(self, numbers: Callable) -> list:
         """The numbers that choose the switching number, as inputs of the jump."""
         return [numbers("hit", self.pieces), *([numbers("entry", self.pieces)] if self.chosen > self.pieces else [])]
 
@@ -169,7 +169,7 @@ class Saltation:
         """The inputs of the jump but for its upper rows; `numbers(name, count)` gives vectors of the motion."""
         return [
             numbers("edge", self.motion.states), numbers("edge_t", 1), numbers("params", self.motion.parameters),
-            numbers("pieces_before", self.pieces), behind, *self._choice(numbers),
+            numbers("pieces_before", self.pieces), behind, *self._switching_choice(numbers),
         ]  # fmt: skip
 
     def push(self, directions: Directions, frame: Frame) -> None:
@@ -186,7 +186,7 @@ class Saltation:
             out = form.run(frame, jump.line, *inputs)
             is_hit, grazes = (directions.number_of(frame, name) for name in ("is_hit", "edge_grazes"))
             added = self._tangent_jumps(frame, form, out, numbers("hit", self.pieces), pieces, is_hit, grazes)
-            for row, i, part, place in self._each(frame, form, range(jump.lower)):
+            for row, i, part, place in self._row_places(frame, form, range(jump.lower)):
                 frame["dy", place, 0] = frame["dy", place, 0] + added(jump.lower + row, i, part)
 
     def pull(self, cotangents: Cotangents) -> Code:
@@ -197,7 +197,7 @@ class Saltation:
         with code.only_if(code.any_lane(self.table.crosses_any(frame))):
             self._note_edge(frame)
             gain, tables, entries = self._cotangent_jumps(frame, frame.vectors("pieces_after", motion.pieces))
-            for row, i, part, place in self._each(frame, motion.form, range(self.jump.lower)):
+            for row, i, part, place in self._row_places(frame, motion.form, range(self.jump.lower)):
                 add(frame, gain(row, i + part * self.base), "state_ct", place)
             for row in range(self.jump.lower):
                 for k in motion.form.each(code, self.parameters):
@@ -222,10 +222,10 @@ class Saltation:
         inputs = self._edge_inputs(lambda name, count: frame.vectors(name, count), behind)
         out = motion.form.run(frame, self.jump.accelerations(n), *inputs)
         hit = frame.vectors("hit", self.pieces)
-        both = _some(out, 0, n), _some(out, n, n)
-        jumps, lost = self._what_jumps(frame, motion.form, hit, behind, *both, frame["grazes"])
+        both = _select_numbers(out, 0, n), _select_numbers(out, n, n)
+        jumps, lost = self._find_jumping_tangents(frame, motion.form, hit, behind, *both, frame["grazes"])
         cotangents, sum = motion.form.room(frame, rows * 2 * n), code.variable(frame.constant(0.0))
-        for row, i, part, place in self._each(frame, motion.form, range(rows)):
+        for row, i, part, place in self._row_places(frame, motion.form, range(rows)):
             ct = frame["state_ct", place]
             if row == 0:
                 ct = code.select(jumps(i, part), ct, 0.0)
@@ -248,11 +248,11 @@ class Saltation:
         return gain, tables, entries
 
 
-def _some(numbers: Numbers, first: int, count: int) -> Numbers:
+def _select_numbers(numbers: Numbers, first: int, count: int) -> Numbers:
     if isinstance(numbers, Vectors):
         return Vectors(count, lambda i: numbers[i + first])
     return numbers[first : first + count]
 
 
-def _field(frame: Frame, name: str, count: int, first: int = 0) -> Vectors:
+def _frame_vectors(frame: Frame, name: str, count: int, first: int = 0) -> Vectors:
     return frame.vectors(name, count, lambda i: (i + first,))

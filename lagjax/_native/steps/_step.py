@@ -44,8 +44,8 @@ class StepControl:
         self.motion, self.error_groups, self.projector = motion, error_groups, projector
         # The motion, and the derivatives that follow it, whose units are others.
         self.parts = [(0, base_size)] + [(base_size, motion.n - base_size)] * (motion.n > base_size)
-        self.size_start = self._size_start()
-        self.defect = self._defect()
+        self.size_start = self._first_step_size()
+        self.defect = self._step_defect()
 
     @staticmethod
     def fields(n: int) -> Fields:
@@ -77,9 +77,9 @@ class StepControl:
         code = frame.code
         with code.only_if(code.any_lane(code.compare("==", frame["steps"], 0.0))):
             frame.call(self.size_start, order)
-        last, before = self._errors(frame, order)
+        last, before = self._last_term_norms(frame, order)
         p = code.as_number(order)
-        a, b = _power(code, last, -1.0 / p), _power(code, before, -1.0 / (p - 1.0))
+        a, b = _approximate_power(code, last, -1.0 / p), _approximate_power(code, before, -1.0 / (p - 1.0))
         size, longest = limits.SAFETY * code.select(a < b, a, b), frame["longest"]
         size = code.select(size < longest, size, longest)
         frame["growth"] = limits.GROWTH
@@ -96,15 +96,15 @@ class StepControl:
         frame["h"] = code.select(going, step * forward, 0.0)
         frame["last"] = going & is_last
 
-    def _errors(self, frame: Frame, order: Value) -> tuple[Value, Value]:
+    def _last_term_norms(self, frame: Frame, order: Value) -> tuple[Value, Value]:
         """The scaled norms of the last two coefficients; `scale` keeps 1 / (floor + rtol·size)."""
         code, n = frame.code, self.motion.n
         rtol = code.lanes_of(frame.job("rtol"))
         errors = [code.variable(frame.constant(0.0)) for _ in range(2)]
         for half in range(2):
-            sizes = self._sizes(frame, half)
+            sizes = self._motion_sizes(frame, half)
             for part, (first, count) in enumerate(self.parts):
-                floor = self._floor(frame, half, part, sizes)
+                floor = self._absolute_tolerance(frame, half, part, sizes)
                 for j in self.motion.form.each(code, count):
                     i = first + j
                     rate = abs(frame["y", i + half * n, 1])
@@ -118,7 +118,7 @@ class StepControl:
                     errors[0].value = sound
         return errors[0].value, errors[1].value
 
-    def _floor(self, frame: Frame, half: int, part: int, sizes: Numbers) -> Value:
+    def _absolute_tolerance(self, frame: Frame, half: int, part: int, sizes: Numbers) -> Value:
         """The absolute tolerance of the coordinates, or of the velocities (half 1), of a part of the motion."""
         code, form, (first, count), place = frame.code, self.motion.form, self.parts[part], 2 * part + half
         given, rtol = (code.lanes_of(frame.job(name)) for name in ("atol", "rtol"))
@@ -133,7 +133,7 @@ class StepControl:
         floor = rtol * code.select(is_small, share, limits.ATOL_OVER_RTOL)
         return code.select(given > 0.0, given, floor)
 
-    def _size_start(self) -> Code:
+    def _first_step_size(self) -> Code:
         """`(order)`: `reach` of the lanes that have taken no step; infinite where nothing moves, or rounding does."""
         motion = self.motion
         frame = motion.function("size_start", INTEGER)
@@ -151,7 +151,7 @@ class StepControl:
                 with code.loop(order - (back + 4)) as k:
                     term = largest(k)
                     ratio = last / (rtol * limits.ATOL_OVER_MOTION * term)
-                    h = _power(code, ratio, code.lanes_of(-1.0 / (p - float(back) - code.as_number(k))))
+                    h = _approximate_power(code, ratio, code.lanes_of(-1.0 / (p - float(back) - code.as_number(k))))
                     allowed.value = code.select((term > 0.0) & (h > allowed.value), h, allowed.value)
                 step.value = code.select(allowed.value < step.value, allowed.value, step.value)
             reach, power = code.variable(frame.constant(0.0)), code.variable(frame.constant(1.0))
@@ -167,7 +167,7 @@ class StepControl:
                 frame["promised", part] = code.flag(promised)
         return frame.finish()
 
-    def _forget_promises(self, frame: Frame, where: Value) -> None:
+    def _forget_size_promise(self, frame: Frame, where: Value) -> None:
         """Let S be infinite where steps do not hold of a motion that was at rest at zero."""
         code, n = frame.code, self.motion.n
         most = code.lanes_of(1.0 / (limits.ATOL_OVER_RTOL * frame.job("rtol")))
@@ -181,7 +181,7 @@ class StepControl:
                     scale = frame["scale", i]
                     frame["scale", i] = code.select(forgets & (most < scale), most, scale)
 
-    def _sizes(self, frame: Frame, half: int) -> Numbers:
+    def _motion_sizes(self, frame: Frame, half: int) -> Numbers:
         """The size over the step of every coordinate, or of every velocity (half 1); the largest one of a group."""
         code, first = frame.code, half * self.motion.n
         before = code.lanes_of(abs(frame["h"]))
@@ -198,7 +198,7 @@ class StepControl:
 
     # ---- whether its series holds ----
 
-    def _defect(self) -> Code:
+    def _step_defect(self) -> Code:
         """`(order, place)`: h ‖P″ − q̈(P, P′)‖ / (p+1) there, into `defect` if larger, and P − y into `increment`."""
         motion, n = self.motion, self.motion.n
         frame = motion.function("defect", INTEGER, DOUBLE)
@@ -209,7 +209,7 @@ class StepControl:
             frame["increment", i] = increments[i]
         moved = motion.move_state(frame, increments)
         acceleration = motion.evaluate(frame, motion.acceleration, moved, s)
-        noise = self._noise(frame, acceleration, increments, moved)
+        noise = self._acceleration_noise(frame, acceleration, increments, moved)
         defect, size = code.variable(frame["defect"]), code.lanes_of(abs(h))
         weight = size / code.as_number(order + 1)
         for i in motion.form.each(code, n):
@@ -220,7 +220,7 @@ class StepControl:
         frame["defect"] = defect.value
         return frame.finish()
 
-    def _noise(self, frame: Frame, acceleration, increments, moved) -> Callable[[Index], Value]:
+    def _acceleration_noise(self, frame: Frame, acceleration, increments, moved) -> Callable[[Index], Value]:
         """The part of component i of an acceleration that rounding may leave at a place of the step."""
         code, n, form = frame.code, self.motion.n, self.motion.form
 
@@ -258,13 +258,13 @@ class StepControl:
                 small = bad & (abs(half) < frame["smallest"])
                 frame["h"] = code.select(small, 0.0, code.select(bad, half, frame["h"]))
                 with frame.where(small):
-                    frame["code"] = self._reason(frame)
+                    frame["code"] = self._small_step_reason(frame)
                 frame["rejected"] = frame["rejected"] + code.flag(bad)
                 frame.assign(bad, last=0.0, growth=limits.GROWTH_AFTER_REJECTION)  # nor is it the last one any more
                 often = (frame["rejected"] >= limits.MOST_REFUSED) & (2.0 * frame["rejected"] >= frame["steps"])
-                self._forget_promises(frame, bad & often)
+                self._forget_size_promise(frame, bad & often)
 
-    def _reason(self, frame: Frame) -> Value:
+    def _small_step_reason(self, frame: Frame) -> Value:
         """Why no step is small enough: the series, or only the way from its end to the constraints."""
         reason = frame.constant(limits.STEP_TOO_SMALL)
         if self.projector is None:
@@ -307,7 +307,7 @@ def absolute_tolerance(frame: Frame) -> Value:
     return frame.code.select(given > 0.0, given, limits.ATOL_OVER_RTOL * frame.job("rtol"))
 
 
-def _power(code: Code, x: Value, exponent: Value) -> Value:
+def _approximate_power(code: Code, x: Value, exponent: Value) -> Value:
     """x**exponent to one per cent, for 0 < −exponent < 1/4, which is all that the size of a step needs.
 
     The bits of a number, read as an integer, are nearly its logarithm; the parabolas mend the fractional part.
