@@ -9,7 +9,7 @@ from lagjax._sweep import Files, Progress, Sweep, run_store
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; the exit status. A mistake is a sentence on stderr."""
-    options = _parser().parse_args(arguments)
+    options = _argument_parser().parse_args(arguments)
     try:
         return options.command(options)
     except (OSError, ValueError, TypeError, ImportError) as error:
@@ -17,7 +17,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
 
 
-def _run(options: argparse.Namespace) -> int:
+def _run_part(options: argparse.Namespace) -> int:
     store = Files(options.store.absolute())
     spec = store.spec()
     show = Progress(store, spec, not options.quiet)
@@ -27,12 +27,12 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _status(options: argparse.Namespace) -> int:
+def _print_status(options: argparse.Namespace) -> int:
     print(Sweep(options.store.absolute()))
     return 0
 
 
-def _check(options: argparse.Namespace) -> int:
+def _check_files(options: argparse.Namespace) -> int:
     swept = Sweep(options.store.absolute())
     damaged = swept.damaged()
     for text in damaged.values():
@@ -41,15 +41,15 @@ def _check(options: argparse.Namespace) -> int:
     return 1 if damaged else 0
 
 
-def _parser() -> argparse.ArgumentParser:
+def _argument_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m lagjax", description="Work on stores of lagjax.")
     commands = parser.add_subparsers(required=True, title="commands")
     of_sweeps = commands.add_parser("sweep", help="a sweep that lagjax.sweep has begun")
     actions = of_sweeps.add_subparsers(required=True, title="actions")
     for name, command, about in (
-        ("run", _run, "compute the units that are missing or damaged (unpickles: run only stores of your own)"),
-        ("status", _status, "tell how far it is"),
-        ("check", _check, "read all that is done, and tell what is damaged"),
+        ("run", _run_part, "compute the units that are missing or damaged (unpickles: run only stores of your own)"),
+        ("status", _print_status, "tell how far it is"),
+        ("check", _check_files, "read all that is done, and tell what is damaged"),
     ):
         action = actions.add_parser(name, help=about, description=about)
         action.add_argument("store", type=Path, metavar="STORE", help="the folder")

@@ -80,13 +80,13 @@ def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, me
 
     >>> lagjax.plot.trajectory(trajectory); lagjax.plot.trajectory(trajectory, lambda q, qdot: (q[0], qdot[0]))
     """
-    (layout, curves), ax = _curves(trajectory, members), _axes(ax)
+    (layout, curves), ax = _curves(trajectory, members), _prepare_axes(ax)
     if projection is not None:
         periods = _pair_of_periods(period, ax)
-        projected = _project(layout, curves, projection)
+        projected = _project_curves(layout, curves, projection)
         draw_curves(ax, [join_curve(*wrap_curve(*line, *periods)) for line in projected], COLORS[0])
         return ax
-    shown, periods = _places(layout, ()), _periods(layout, period)
+    shown, periods = _coordinate_places(layout, ()), _angle_periods(layout, period)
     for color, i in zip(COLORS, shown, strict=False):
         lines = [join_curve(*wrap_curve(t, q[:, i], None, periods[i])) for t, q, _ in curves]
         draw_curves(ax, lines, color, layout.names[i], 1.5)
@@ -96,8 +96,8 @@ def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, me
     marked = trajectory.impacts is not None and _mark_impacts(ax, trajectory.impacts, members)
     if layout.size == 1:
         ax.set_ylabel(layout.names[0])
-        return _legend(ax) if marked or shaded else ax
-    return _legend(ax, len(shown), layout)
+        return _add_legend(ax) if marked or shaded else ax
+    return _add_legend(ax, len(shown), layout)
 
 
 def _shade_spans(ax, trajectory: Trajectory) -> bool:
@@ -143,11 +143,11 @@ def space_time(trajectory: Trajectory, row: str | None = None, *, period: float 
     chosen = [i for i, name in enumerate(names) if row in (None, kind, name) or name.startswith(f"{row}[")]
     if not chosen:
         raise ValueError(f"There is no row {row!r}; there are {join_names(layout.paths)}, and their velocities.")
-    ax, values = _axes(ax), np.ma.masked_invalid(getattr(course, kind).T[chosen])
+    ax, values = _prepare_axes(ax), np.ma.masked_invalid(getattr(course, kind).T[chosen])
     style = dict(cmap=cmap or "viridis")
     if period is not None:
         _require_period(period)
-        values = _wrap(values, period)
+        values = _wrap_values(values, period)
         style = dict(cmap=cmap or "twilight", vmin=-period / 2, vmax=period / 2)
     mesh = ax.pcolormesh(course.t, np.arange(len(chosen)), values, shading="nearest", rasterized=True, **style)
     ax.set(xlabel="t", ylabel="coordinate")
@@ -155,7 +155,7 @@ def space_time(trajectory: Trajectory, row: str | None = None, *, period: float 
     if len(chosen) <= len(COLORS):
         ax.set_yticks(np.arange(len(chosen)), [names[i] for i in chosen])
     ax.grid(False)
-    _draw_angles(_colorbar(mesh, ax, label or row or "q").ax.yaxis, [period])
+    _draw_angles(_add_colorbar(mesh, ax, label or row or "q").ax.yaxis, [period])
     return ax
 
 
@@ -170,8 +170,8 @@ def phase(trajectory: Trajectory, *coordinates: str, members: int = 30, period: 
 
     >>> lagjax.plot.phase(trajectory, "q['theta']")
     """
-    (layout, curves), ax = _curves(trajectory, members), _axes(ax)
-    places, periods = _places(layout, coordinates), _periods(layout, period)
+    (layout, curves), ax = _curves(trajectory, members), _prepare_axes(ax)
+    places, periods = _coordinate_places(layout, coordinates), _angle_periods(layout, period)
     for color, i in zip(COLORS, places, strict=False):
         lines = [wrap_curve(q[:, i], qdot[:, i], periods[i]) for _, q, qdot in curves]
         draw_curves(ax, lines, color, layout.names[i])
@@ -182,10 +182,10 @@ def phase(trajectory: Trajectory, *coordinates: str, members: int = 30, period: 
         ax.set(xlabel=name, ylabel="qdot" + name.removeprefix("q"))
         return ax
     ax.set(xlabel="coordinate", ylabel="velocity")
-    return _legend(ax, len(places), layout)
+    return _add_legend(ax, len(places), layout)
 
 
-def _places(layout: Layout, coordinates: tuple[str, ...], most: int = len(COLORS)) -> list[int]:
+def _coordinate_places(layout: Layout, coordinates: tuple[str, ...], most: int = len(COLORS)) -> list[int]:
     """The places of coordinates by their names; the first ones, at `most`, where none is named."""
     if not coordinates:
         return list(range(min(layout.size, most)))
@@ -210,15 +210,15 @@ def compare(one: Trajectory, other, *coordinates: str, figure=None):
     _require_numbers(one, "one")
     layout, course = course_of(one)
     t, q, _ = course.curve()
-    ts, values, style = _other(other, layout)
-    places = _places(layout, coordinates, most=4)
-    figure = _wide_figure(len(places)) if figure is None else figure
+    ts, values, style = _comparison_curve(other, layout)
+    places = _coordinate_places(layout, coordinates, most=4)
+    figure = _new_wide_figure(len(places)) if figure is None else figure
     axes = figure.subplots(2, len(places), squeeze=False, sharex="col", gridspec_kw={"height_ratios": [2, 1]})
     left = course.states_at(ts)[0] - values
     for (above, below), i in zip(axes.T, places, strict=True):
-        _axes(above).plot(t, q[:, i], color=COLORS[0], linewidth=1.5, label="motion")
+        _prepare_axes(above).plot(t, q[:, i], color=COLORS[0], linewidth=1.5, label="motion")
         above.plot(ts, values[:, i], style, color=COLORS[1], markersize=3.0, linewidth=1.2, label="other")
-        _axes(below).plot(ts, left[:, i], style[0], color=COLORS[1], markersize=3.0, linewidth=1)
+        _prepare_axes(below).plot(ts, left[:, i], style[0], color=COLORS[1], markersize=3.0, linewidth=1)
         above.set_title(layout.names[i], fontsize="medium")
         below.set_xlabel("t")
     axes[1][0].set_ylabel("motion − other")
@@ -226,7 +226,7 @@ def compare(one: Trajectory, other, *coordinates: str, figure=None):
     return axes
 
 
-def _other(other, layout: Layout) -> tuple[np.ndarray, np.ndarray, str]:
+def _comparison_curve(other, layout: Layout) -> tuple[np.ndarray, np.ndarray, str]:
     """The times (T,), the values (T, n) and the style of what a motion is compared with."""
     if isinstance(other, Trajectory):
         _require_numbers(other, "other")
@@ -261,7 +261,7 @@ def modes(modes: Modes, points: Callable | None = None, q: Any = None, params: A
 
     >>> lagjax.plot.modes(lagjax.normal_modes(scene, q, params))
     """
-    _require(modes, "modes", Modes, "normal_modes")
+    _require_result(modes, "modes", Modes, "normal_modes")
     frequencies = np.asarray(modes.frequencies)
     if frequencies.ndim != 1:
         raise ValueError(f"Draw the modes of one equilibrium at a time; these are {frequencies.shape[:-1]} of them.")
@@ -271,22 +271,22 @@ def modes(modes: Modes, points: Callable | None = None, q: Any = None, params: A
         given, shape = (jax.tree.map(jnp.shape, x) for x in (q, jax.tree.map(lambda leaf: leaf[0], modes.shapes)))
         if given != shape:
             raise ValueError(f"q must be the equilibrium of these modes, with shapes {shape}; got {given}.")
-    shown, shapes = min(_positive(count, "count"), len(frequencies)), _align_phases(modes.shapes)
-    matplotlib = _matplotlib()
+    shown, shapes = min(_count(count, "count"), len(frequencies)), _align_phases(modes.shapes)
+    matplotlib = _import_matplotlib()
     if figure is None:
         figure = matplotlib.pyplot.figure(figsize=(min(2.4 * shown + 1.0, 12.8), 3.2), layout="constrained")
     axes = figure.subplots(1, shown, squeeze=False, sharey=True, sharex=points is not None)[0]
     for k, ax in enumerate(axes):
         shape = jax.tree.map(lambda leaf, k=k: leaf[k], shapes)
         if points is None:
-            _bars(_axes(ax), shape)
+            _deviation_bars(_prepare_axes(ax), shape)
         else:
-            _draw_swings(_axes(ax), accept(points, "points", ("q",)), q, shape, params, largest)
-        ax.set_title(_rates(modes, k), fontsize="medium")
+            _draw_swings(_prepare_axes(ax), accept(points, "points", ("q",)), q, shape, params, largest)
+        ax.set_title(_describe_rates(modes, k), fontsize="medium")
     return axes
 
 
-def _rates(modes: Modes, k: int) -> str:
+def _describe_rates(modes: Modes, k: int) -> str:
     """The frequency of a mode, its damping ratio if it has one, and how fast it grows if it does."""
     exponents, ratio = np.asarray(modes.exponents), float(modes.damping_ratios[k])
     growth, rounding = float(exponents[k].real.max()), 10 * np.finfo(exponents.dtype).eps ** 0.5
@@ -303,7 +303,7 @@ def _align_phases(shapes):
     return jax.tree.map(lambda leaf: jnp.real(leaf * turn.reshape(-1, *[1] * (leaf.ndim - 1))), shapes)
 
 
-def _bars(ax, shape) -> None:
+def _deviation_bars(ax, shape) -> None:
     """The deviation of every coordinate as a bar, the largest one of length one."""
     layout = Layout.from_state(shape, shape)
     deviation = np.asarray(layout.flatten(shape))
@@ -337,7 +337,7 @@ def path(x, y, *, values=None, label: str | None = None, cmap: str = "viridis", 
 
     >>> lagjax.plot.path(trajectory, lambda q, qdot: (q[0], q[1]), values=trajectory.ts, label="t [s]")
     """
-    matplotlib = _matplotlib()
+    matplotlib = _import_matplotlib()
     if isinstance(x, Trajectory):
         _require_numbers(x, "x")
         layout, course = course_of(x)
@@ -345,8 +345,8 @@ def path(x, y, *, values=None, label: str | None = None, cmap: str = "viridis", 
         if values is not None:
             order = np.argsort(np.asarray(x.ts))
             values = np.interp(curve[0], np.asarray(x.ts)[order], np.asarray(values)[order])
-        ((x, y),) = _project(layout, [curve], y)
-    ax = _axes(ax)
+        ((x, y),) = _project_curves(layout, [curve], y)
+    ax = _prepare_axes(ax)
     ax.set_aspect("equal", adjustable="datalim")
     if values is None:
         ax.plot(x, y, linewidth=1.2, label=label)
@@ -359,7 +359,7 @@ def path(x, y, *, values=None, label: str | None = None, cmap: str = "viridis", 
     lines.set(array=(values[:-1] + values[1:]) / 2, capstyle="round")
     ax.add_collection(lines)
     ax.autoscale_view()
-    _colorbar(lines, ax, label)
+    _add_colorbar(lines, ax, label)
     return ax
 
 
@@ -376,13 +376,13 @@ def poincare(crossings: Crossings, projection: Callable, *, values=None, label: 
     >>> lagjax.plot.poincare(crossings, lambda q, qdot: (q[1], qdot[1]))
     """
     x, y, members = _section_points(crossings, projection)
-    ax = _axes(ax)
-    x, y = map(_wrap, (x, y), _pair_of_periods(period, ax))
+    ax = _prepare_axes(ax)
+    x, y = map(_wrap_values, (x, y), _pair_of_periods(period, ax))
     if values is None:
-        _scatter(ax, x, y, np.array(COLORS)[members % len(COLORS)], size)
+        _scatter_points(ax, x, y, np.array(COLORS)[members % len(COLORS)], size)
         return ax
-    points = _scatter(ax, x, y, np.asarray(values)[members], size, cmap="viridis")
-    _colorbar(points, ax, label)
+    points = _scatter_points(ax, x, y, np.asarray(values)[members], size, cmap="viridis")
+    _add_colorbar(points, ax, label)
     return ax
 
 
@@ -393,10 +393,10 @@ def return_map(crossings: Crossings, value: Callable, *, ax=None):
 
     >>> lagjax.plot.return_map(crossings, lambda q, qdot: q[1])
     """
-    ax = _axes(ax)
+    ax = _prepare_axes(ax)
     x, _, members = _section_points(crossings, lambda q, qdot: (value(q, qdot), value(q, qdot)))
     same = members[1:] == members[:-1]
-    _scatter(ax, x[:-1][same], x[1:][same], COLORS[0])
+    _scatter_points(ax, x[:-1][same], x[1:][same], COLORS[0])
     low, high = (float(end) for end in (x.min(initial=0.0), x.max(initial=0.0)))
     ax.plot([low, high], [low, high], color=GREY, linewidth=0.8)
     ax.set(xlabel="at one crossing", ylabel="at the next")
@@ -405,14 +405,14 @@ def return_map(crossings: Crossings, value: Callable, *, ax=None):
 
 def _section_points(crossings: Crossings, projection: Callable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """x and y of all crossings, and the member that each belongs to. Raises `ValueError` where there are none."""
-    _require(crossings, "crossings", Crossings, "crossings", " for one section")
+    _require_result(crossings, "crossings", Crossings, "crossings", " for one section")
     t = np.asarray(crossings.t)
     if not np.isfinite(t).any():
         advice = "Follow the motion longer, or move it."
         raise ValueError(f"The section was never crossed: there is nothing to draw. {advice}")
     state = crossings.q, crossings.qdot
     states = jax.tree.map(lambda leaf: jnp.asarray(leaf).reshape(-1, *leaf.shape[t.ndim :]), state)
-    x, y = map(np.asarray, jax.vmap(_pair(projection))(*states))
+    x, y = map(np.asarray, jax.vmap(_checked_projection(projection))(*states))
     there = np.isfinite(t.ravel())
     members = np.repeat(np.arange(t.size // t.shape[-1]), t.shape[-1])
     return x[there], y[there], members[there]
@@ -447,8 +447,8 @@ def bifurcation(system, over, strobe=None, q0=0.0, qdot0=0.0, params=None, *, va
     x, y = x[known := np.isfinite(y)], y[known]
     if not len(x):
         raise ValueError("No member has a finite point: simulate one of them, whose message says why.")
-    ax = _axes(ax)
-    _scatter(ax, x, _wrap(y, period), COLORS[len(ax.collections) % len(COLORS)])
+    ax = _prepare_axes(ax)
+    _scatter_points(ax, x, _wrap_values(y, period), COLORS[len(ax.collections) % len(COLORS)])
     _draw_angles(ax.yaxis, [period if period is None else _require_period(period)])
     ax.set(xlabel=names[0], ylabel=names[1])
     return ax
@@ -459,7 +459,7 @@ def _stroboscopic_points(scene, over, start: tuple, value: Callable | None, tran
     axes = axes_of(over)
     if len(axes) != 1:
         raise ValueError(f"over must have one axis; got {join_names([axis.dimension for axis in axes])}.")
-    names, times = axes[0].names, 1 + _positive(transient, "transient", 0) + np.arange(_positive(points, "points"))
+    names, times = axes[0].names, 1 + _count(transient, "transient", 0) + np.arange(_count(points, "points"))
     if start[0] is None:
         raise ValueError("strobe is the period of the drive, 2π/ω: give it, or a function of the point.")
     if not any(map(callable, start)) and not (isinstance(start[3], dict) and {*names} & {*start[3]}):
@@ -503,7 +503,7 @@ def energy_error(trajectory: Trajectory, *, scale: float | None = None, ax=None)
     unit = np.abs(h[:, :1]) if scale is None else np.asarray(scale, float)
     if not np.all(unit > 0):
         raise ValueError("The energy at the start is zero: say with scale=... which energy counts as one.")
-    ax = _axes(ax)
+    ax = _prepare_axes(ax)
     error = np.abs(h - h[:, :1]) / unit
     known = np.array(np.isfinite(error).any(axis=0))  # nothing is left of members that an event has ended
     known[0] = False  # zero, which has no logarithm
@@ -517,7 +517,7 @@ def energy_error(trajectory: Trajectory, *, scale: float | None = None, ax=None)
     ax.plot(times, np.where(median > 0, median, np.nan), color=COLORS[0], linewidth=1.5, label="median")
     what = "change" if does_work(trajectory) or _loses_at_transitions(trajectory, h) else "error"
     ax.set(yscale="log", xlabel="t", ylabel=f"relative {what} of the energy")
-    return _legend(ax) if len(h) > 1 else ax
+    return _add_legend(ax) if len(h) > 1 else ax
 
 
 def _loses_at_transitions(trajectory: Trajectory, h: np.ndarray) -> bool:
@@ -538,8 +538,8 @@ def work_precision(result: WorkPrecision, *, ax=None):
 
     >>> lagjax.plot.work_precision(lagjax.work_precision(scene, q0, qdot0, ts, params))
     """
-    _require(result, "result", WorkPrecision, "work_precision")
-    ax = _axes(ax)
+    _require_result(result, "result", WorkPrecision, "work_precision")
+    ax = _prepare_axes(ax)
     for i, solver in enumerate(dict.fromkeys(row.solver for row in result)):
         rows = [row for row in result if row.solver == solver]
         color, marker = COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)]
@@ -549,7 +549,7 @@ def work_precision(result: WorkPrecision, *, ax=None):
     left = min(ax.get_xlim()[0], result.reference_error / 3)
     ax.axvspan(left, result.reference_error, color="0.92", linewidth=0, zorder=0, label="not resolved")
     ax.set_xlim(left=left)
-    return _legend(ax)
+    return _add_legend(ax)
 
 
 def fit(fit: Fit, record: int = 0, *, figure=None):
@@ -559,10 +559,10 @@ def fit(fit: Fit, record: int = 0, *, figure=None):
 
     >>> lagjax.plot.fit(fit, record=3)
     """
-    _require(fit, "fit", Fit, "fit")
+    _require_result(fit, "fit", Fit, "fit")
     one, columns = fit.records[record], fit.residual_function.columns(record)
     names = fit.residual_function.names[columns]
-    figure = _wide_figure(len(names)) if figure is None else figure
+    figure = _new_wide_figure(len(names)) if figure is None else figure
     return draw_record(figure, one, fit.residual_matrices[record], names, fit.noise_scale.sigma[columns])
 
 
@@ -573,7 +573,7 @@ def profile(profile, *, ax=None):
 
     >>> lagjax.plot.profile(fit.profile("params['friction']"))
     """
-    ax = _axes(ax)
+    ax = _prepare_axes(ax)
     values, deviance = np.asarray(profile.values), np.asarray(profile.deviance)
     near = deviance <= 3.0 * profile.threshold
     first, last = (0, len(near) - 1) if not near.any() else np.flatnonzero(near)[[0, -1]]
@@ -588,7 +588,7 @@ def profile(profile, *, ax=None):
     ax.axhspan(profile.threshold, top, color="0.92", linewidth=0, zorder=0, label=f"excluded at {profile.level:.0%}")
     ax.set(xlabel=profile.name, ylabel="deviance", ylim=(min(0.0, float(deviance.min())) - 0.02 * top, top))
     ax.locator_params(axis="x", nbins=6)
-    return _legend(ax)
+    return _add_legend(ax)
 
 
 def state_map(x, y, values, *, label: str | None = None, cmap: str = "magma", norm=None, ax=None):
@@ -602,22 +602,22 @@ def state_map(x, y, values, *, label: str | None = None, cmap: str = "magma", no
     values = np.ma.masked_invalid(np.asarray(values))
     if values.shape != (len(y), len(x)):
         raise ValueError(f"values must have shape (len(y), len(x)) = {(len(y), len(x))}; got {values.shape}.")
-    ax = _axes(ax)
+    ax = _prepare_axes(ax)
     ax.grid(False)
-    colors, extent = _matplotlib().colormaps[cmap].with_extremes(bad="white"), (*_edges(x), *_edges(y))
+    colors, extent = _import_matplotlib().colormaps[cmap].with_extremes(bad="white"), (*_cell_edges(x), *_cell_edges(y))
     style: dict[str, Any] = dict(origin="lower", aspect="auto", interpolation="nearest", cmap=colors, norm=norm)
-    _colorbar(ax.imshow(values, extent=extent, **style), ax, label)
+    _add_colorbar(ax.imshow(values, extent=extent, **style), ax, label)
     return ax
 
 
-def _matplotlib():
+def _import_matplotlib():
     return import_package("lagjax.plot", "matplotlib", "lagjax[examples]", "collections", "colors", "pyplot")
 
 
-def _axes(ax):
+def _prepare_axes(ax):
     """`ax`, or the one of a new figure, with a light grid behind the data and no box around it."""
     if ax is None:
-        _, ax = _matplotlib().pyplot.subplots(figsize=(6.4, 4.2), layout="constrained")
+        _, ax = _import_matplotlib().pyplot.subplots(figsize=(6.4, 4.2), layout="constrained")
     return simplify_axes(ax)
 
 
@@ -627,7 +627,7 @@ def _require_period(period) -> float:
     return float(period)
 
 
-def _periods(layout: Layout, period) -> list[float | None]:
+def _angle_periods(layout: Layout, period) -> list[float | None]:
     """The period of every coordinate, None of those that are no angles."""
     leaves = spread_prefix(period, layout.restore(np.zeros(layout.size)), "period", "a number")
     sizes = [int(np.prod(shape)) for shape in layout.shapes]
@@ -643,7 +643,7 @@ def _pair_of_periods(period, ax) -> tuple[float | None, float | None]:
     return of_x, of_y
 
 
-def _wrap(x, period: float | None):
+def _wrap_values(x, period: float | None):
     """Values in −P/2 … P/2."""
     return x if period is None else x - period * np.floor(x / period + 0.5)
 
@@ -668,30 +668,30 @@ def _name_angle(part: Fraction) -> str:
     return f"{'−' * (part < 0)}{whole}π{'' if part.denominator == 1 else f'/{part.denominator}'}"
 
 
-def _scatter(ax, x, y, colors, size: float | None = None, **more):
+def _scatter_points(ax, x, y, colors, size: float | None = None, **more):
     """Points whose `size` is by default what suits how many there are."""
     size = float(np.clip(2e4 / max(1, len(x)), 0.02, 9.0)) if size is None else size
     return ax.scatter(x, y, c=colors, s=size, linewidths=0, rasterized=True, **more)
 
 
-def _wide_figure(columns: int):
-    return _matplotlib().pyplot.figure(figsize=(max(6.4, 3.6 * columns), 4.6), layout="constrained")
+def _new_wide_figure(columns: int):
+    return _import_matplotlib().pyplot.figure(figsize=(max(6.4, 3.6 * columns), 4.6), layout="constrained")
 
 
-def _legend(ax, shown: int = 0, layout: Layout | None = None):
+def _add_legend(ax, shown: int = 0, layout: Layout | None = None):
     """The axes with a legend, whose title says how many coordinates are `shown` where these are not all."""
     title = None if layout is None or shown == layout.size else f"{shown} of {layout.size} coordinates"
     ax.legend(frameon=False, title=title)
     return ax
 
 
-def _colorbar(mappable, ax, label):
+def _add_colorbar(mappable, ax, label):
     bar = ax.figure.colorbar(mappable, ax=ax, label=label, pad=0.02)
     bar.outline.set_visible(False)
     return bar
 
 
-def _edges(centres) -> tuple[float, float]:
+def _cell_edges(centres) -> tuple[float, float]:
     """The outer edges of evenly spaced cells."""
     if len(centres) < 2:
         raise ValueError("A map needs two columns and two rows at least: x and y are the centres of its cells.")
@@ -699,17 +699,17 @@ def _edges(centres) -> tuple[float, float]:
     return float(centres[0] - half), float(centres[-1] + half)
 
 
-def _require(value, name: str, kind: type, function: str, more: str = "") -> None:
+def _require_result(value, name: str, kind: type, function: str, more: str = "") -> None:
     if not isinstance(value, kind):
         raise TypeError(f"{name} must be what lagjax.{function} returns{more}; got {type(value).__name__}.")
 
 
 def _require_numbers(trajectory, name: str) -> None:
-    _require(trajectory, name, Trajectory, "simulate")
+    _require_result(trajectory, name, Trajectory, "simulate")
     require_numbers(trajectory, "lagjax.plot draws")
 
 
-def _positive(count, name: str, least: int = 1) -> int:
+def _count(count, name: str, least: int = 1) -> int:
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < least:
         raise ValueError(f"{name} must be a whole number, {('zero', 'one')[least]} at least; got {count!r}.")
     return int(count)
@@ -718,20 +718,20 @@ def _positive(count, name: str, least: int = 1) -> int:
 def _curves(trajectory: Trajectory, members: int) -> tuple[Layout, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
     """The curves (t, q, q̇) of at most this many members, evenly chosen, and the layout of their coordinates."""
     _require_numbers(trajectory, "trajectory")
-    chosen = even_places(max(1, np.size(trajectory.ok)), _positive(members, "members"))
+    chosen = even_places(max(1, np.size(trajectory.ok)), _count(members, "members"))
     layout, courses = courses_of(trajectory, chosen)
     return layout, [course.curve() for course in courses]
 
 
-def _project(layout: Layout, curves: list, projection: Callable) -> list[tuple[np.ndarray, np.ndarray]]:
+def _project_curves(layout: Layout, curves: list, projection: Callable) -> list[tuple[np.ndarray, np.ndarray]]:
     """The curves in the plane, x and y of each; NaN where a state jumps."""
     q, qdot = (np.concatenate([curve[part] for curve in curves]).astype(layout.dtype) for part in (1, 2))
     states = map(layout.restore, map(jnp.asarray, (q, qdot)))
-    xy = np.where(np.isfinite(q).all(axis=1), np.stack(jax.vmap(_pair(projection))(*states)), np.nan)
+    xy = np.where(np.isfinite(q).all(axis=1), np.stack(jax.vmap(_checked_projection(projection))(*states)), np.nan)
     return [tuple(part) for part in np.split(xy, np.cumsum([len(t) for t, _, _ in curves])[:-1], axis=1)]
 
 
-def _pair(projection: Callable) -> Callable:
+def _checked_projection(projection: Callable) -> Callable:
     """A projection, with a sentence where it does not return two numbers."""
 
     try:

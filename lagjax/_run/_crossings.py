@@ -132,7 +132,7 @@ def crossings(
         ts = jnp.asarray(ts)[jnp.array([0, -1])]
         watched = scene.with_sections(functions, directions, count)
         run = follow_modes(watched, q0, qdot0, ts, params, rtol, atol, max_steps, throw=False)
-        notes = _notes_of(run, len(scene.transitions), len(functions))
+        notes = _notes_from_hybrid(run, len(scene.transitions), len(functions))
         return _read_crossings(notes, ts, len(functions), count, layout, names, throw, inputs)
     problem = Problem.from_arguments(scene, layout, q0, qdot0, ts, params, rtol, atol, max_steps)
     if has_constraints(scene):
@@ -143,14 +143,14 @@ def crossings(
         return _read_crossings(notes, problem.ts, len(functions), count, layout, names, throw, inputs)
     surfaces = surfaces_in(problem, functions, directions, names)
     solution, noted = MachineCode().crossings(problem, surfaces, count)
-    how = _how_it_ended if isinstance(solution.y_end, np.ndarray) else _how_it_ended_traced
+    how = _overall_result if isinstance(solution.y_end, np.ndarray) else _how_it_ended_traced
     result, end, ok = how(noted, solution, count)
     if throw:
         noted = _raise_unless_ok(layout, problem.ts, end, noted, result)
     return restore_crossings(problem.layout, names, noted, ok)
 
 
-def _notes_of(run: Trajectory, first: int, sections: int) -> tuple:
+def _notes_from_hybrid(run: Trajectory, first: int, sections: int) -> tuple:
     """The notes of a hybrid motion, as of `note_sections`: of transitions from place `first` of the list on."""
     changes, flatten = run.transitions, Layout.from_state(*run.end[1:]).flatten
     assert changes is not None
@@ -174,7 +174,7 @@ def _read_crossings(notes: tuple, ts, sections: int, count: int, layout: Layout,
     return restore_crossings(layout, names, noted, (result == SUCCESSFUL) & ~many)
 
 
-def _how_it_ended(noted: Noted, solution: Solution, count: int, library: Any = np) -> tuple:
+def _overall_result(noted: Noted, solution: Solution, count: int, library: Any = np) -> tuple:
     """The result of the whole, the time and state up to which all is there, and which sections have all crossings."""
     well, many = solution.result == SUCCESSFUL, noted.count > count
     too_many = well & library.any(many)
@@ -186,7 +186,7 @@ def _how_it_ended(noted: Noted, solution: Solution, count: int, library: Any = n
     return result, (t_end, library.where(too_many, noted.y[first, -1], solution.y_end)), well & ~many
 
 
-_how_it_ended_traced = jax.jit(functools.partial(_how_it_ended, library=jnp), static_argnums=2)
+_how_it_ended_traced = jax.jit(functools.partial(_overall_result, library=jnp), static_argnums=2)
 
 
 def _raise_unless_ok(layout: Layout, ts, end: tuple, noted: Noted, result) -> Noted:

@@ -197,16 +197,16 @@ class RunSettings:
         return cls(engine if known else None, given, problem.max_steps, **more)
 
     @functools.cached_property
-    def _key(self) -> tuple:
+    def _settings_key(self) -> tuple:
         leaves, structure = jax.tree.flatten(self.engine)
         numbers = [(np.shape(x), np.asarray(x).tobytes()) if eqx.is_array_like(x) else x for x in leaves]
         return structure, *numbers, self.tolerances, self.max_steps, self.max_transitions, self.transitions
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, RunSettings) and self._key == other._key
+        return isinstance(other, RunSettings) and self._settings_key == other._settings_key
 
     def __hash__(self) -> int:
-        return hash(self._key)
+        return hash(self._settings_key)
 
 
 class Trajectory(eqx.Module):
@@ -513,7 +513,7 @@ class Trajectory(eqx.Module):
         if isinstance(self.system, System):
             return getattr(self.system, name)(q, qdot, t, params, *more)
         if name not in ("energy", "momentum", "_required_force"):  # which every mode has
-            _require_like_constraints(self.system, name, q, qdot, params)
+            _require_equal_constraints(self.system, name, q, qdot, params)
         total = None
         for index, which in enumerate(self.mode_names):
             # Laws of another mode may be singular here: their NaN must not reach a derivative.
@@ -524,7 +524,7 @@ class Trajectory(eqx.Module):
         return total
 
 
-def _require_like_constraints(modes: dict[str, System], name: str, q, qdot, params) -> None:
+def _require_equal_constraints(modes: dict[str, System], name: str, q, qdot, params) -> None:
     """Raise where modes do not have the same constraints, so that there is no one structure to return."""
     constrained = [which for which, system in modes.items() if has_constraints(system)]
     structures = [modes[which]._constraint_structure(Layout.from_state(q, qdot), params) for which in constrained]

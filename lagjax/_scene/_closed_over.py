@@ -31,7 +31,7 @@ class Lifted(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _Trace:
+class _FunctionTrace:
     """A function of the user as it was traced, for parameters that are `Lifted`."""
 
     name: str
@@ -121,5 +121,5 @@ def _lift_function(function: Function, roles: int, problem: Problem, values: lis
     # The first arguments of the trace are what it took from outside. An edition also says where the
     # values stand in it, so that equal functions with equal places are one.
     jaxpr = closed.jaxpr.replace(constvars=[], invars=[*closed.jaxpr.constvars, *closed.jaxpr.invars])
-    trace = _Trace(function.name, jaxpr, constants, places, jax.tree.structure(shapes))
+    trace = _FunctionTrace(function.name, jaxpr, constants, places, jax.tree.structure(shapes))
     return Function(None, function.code.trace_edition(trace, f"{places} {closed.in_avals}"), extras)

@@ -74,7 +74,7 @@ class ContactScene(eqx.Module):
         def ask_user(function: Callable | None):
             return function and (lambda *arguments: function(*arguments[:-1], arguments[-1].params))
 
-        constraints = self._hold(own, flat, layout)
+        constraints = self._hold_contacts(own, flat, layout)
         if self.is_open:
             constraints = Constraints(ask_user(own.on_positions), ask_user(own.on_velocities))
         lagrangian, forces, dissipation = map(ask_user, (free.lagrangian, free.forces, free.dissipation))
@@ -93,7 +93,7 @@ class ContactScene(eqx.Module):
 
         return couple_forces(motion, law, layout, params)
 
-    def _hold(self, own: Constraints, flat: "Flat", layout: Layout) -> Constraints:
+    def _hold_contacts(self, own: Constraints, flat: "Flat", layout: Layout) -> Constraints:
         """The constraints of the system with the rows that hold its contacts behind them, and their friction."""
 
         def held_positions(q, t, p):
@@ -259,7 +259,7 @@ class Shapes(NamedTuple):
         if not sum(counts):
             raise ValueError("contacts, or one_way, returns no number: it must return the gaps that stay >= 0.")
         names = system.contact_names(layout, params)
-        rough, directions = _rough(system, layout, params, trees[0])
+        rough, directions = _friction_directions(system, layout, params, trees[0])
         shapes = Shapes(tuple(trees), counts[0], sum(counts), rough, directions, names)
         numbers, code = eqx.partition(params, eqx.is_array_like)
         for role in ("restitution", "friction"):
@@ -285,7 +285,7 @@ class Shapes(NamedTuple):
         if isinstance(value, dict) and isinstance(tree, dict):
             if unknown := [name for name in value if name not in tree]:
                 raise ValueError(f"{role} names {unknown[0]!r}, and the contacts are {', '.join(map(repr, tree))}.")
-            of = [_spread_over(leaf.shape, value.get(name, 0.0), role) for name, leaf in sorted(tree.items())]
+            of = [_spread_coefficient(leaf.shape, value.get(name, 0.0), role) for name, leaf in sorted(tree.items())]
             return jnp.concatenate([*map(jnp.ravel, of), none])
         if len(jax.tree.leaves(value)) != 1:
             raise TypeError(f"{role} must be a number for all contacts, or a dict by the names of the contacts.")
@@ -295,14 +295,14 @@ class Shapes(NamedTuple):
                 f"{role} must be a dict by the names of the contacts, which are {', '.join(map(repr, tree))}."
             )
         flat = leaf if jnp.ndim(leaf) < 2 else jnp.ravel(leaf)
-        return jnp.concatenate([_spread_over((self.of_gaps,), flat, role), none])
+        return jnp.concatenate([_spread_coefficient((self.of_gaps,), flat, role), none])
 
     def name_numbers(self, numbers) -> PyTree:
         """Numbers of all contacts, (…, k), in the structure that the user's functions return."""
         return name_numbers(numbers, tuple(tree for tree in self.trees if tree is not None))
 
 
-def _spread_over(shape: tuple[int, ...], value, role: str):
+def _spread_coefficient(shape: tuple[int, ...], value, role: str):
     """A coefficient for each of some contacts."""
     try:
         return jnp.broadcast_to(value, shape)
@@ -313,7 +313,7 @@ def _spread_over(shape: tuple[int, ...], value, role: str):
         ) from None
 
 
-def _rough(system: System, layout: Layout, params: PyTree, tree: PyTree) -> tuple[np.ndarray, int]:
+def _friction_directions(system: System, layout: Layout, params: PyTree, tree: PyTree) -> tuple[np.ndarray, int]:
     """The places of contacts with friction, and the directions in which each slips."""
     if system.slip is None:
         return np.zeros(0, int), 1

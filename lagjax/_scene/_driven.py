@@ -46,15 +46,15 @@ class _FunctionOfInputs(eqx.Module):
 def drive_scene(system: System, find_inputs: Callable, extras: tuple[str, ...] = ("params",)) -> System:
     """The scene for parameters that are `Driven`; `extras` are what finding the inputs takes, "params" or "t" too."""
     arrays, scene = jax.tree.flatten(system)
-    return _driven(system, find_inputs, extras) if arrays else _driven_once(scene, find_inputs, extras)
+    return _drive_system(system, find_inputs, extras) if arrays else _driven_from_tree(scene, find_inputs, extras)
 
 
 @functools.lru_cache(maxsize=64)
-def _driven_once(scene: Any, find_inputs: Callable, extras: tuple[str, ...]) -> System:
-    return _driven(jax.tree.unflatten(scene, []), find_inputs, extras)
+def _driven_from_tree(scene: Any, find_inputs: Callable, extras: tuple[str, ...]) -> System:
+    return _drive_system(jax.tree.unflatten(scene, []), find_inputs, extras)
 
 
-def _driven(system: System, find_inputs: Callable, extras: tuple[str, ...]) -> System:
+def _drive_system(system: System, find_inputs: Callable, extras: tuple[str, ...]) -> System:
     functions = {role: getattr(system, role) for role in ROLES}
     return replace_functions(
         system, {role: f and drive_function(f, find_inputs, extras) for role, f in functions.items()}

@@ -128,7 +128,7 @@ def explain(problem: Problem) -> Explanation:
     """The facts about the scene of a problem, and which engine is chosen for it."""
     derivation = problem.derivation
     names, n, motion = derivation.layout.names, derivation.layout.size, derivation.motion
-    known = {"coordinates": names, **_engine(problem)}
+    known = {"coordinates": names, **_engine_facts(problem)}
     if derivation.form.is_sparse:
         return Explanation(**known, **_borders_in_lines(problem), **_facts_of_arrays(derivation))
     try:
@@ -144,9 +144,9 @@ def explain(problem: Problem) -> Explanation:
     mass, lagrangian = named("mass_matrix"), named("lagrangian")
     return Explanation(
         **known,
-        **_borders(problem, inputs),
+        **_border_facts(problem, inputs),
         cyclic=tuple(name for name in names if name not in lagrangian),
-        mass_matrix=f"{'varying' if mass else 'constant'}, {_pattern(matrix, n)}",
+        mass_matrix=f"{'varying' if mass else 'constant'}, {_pattern_kind(matrix, n)}",
         mass_matrix_depends_on=tuple(name for name in inputs if name in mass),
         velocity_terms=any(i in force for i in range(n, 2 * n)),
         explicit_time="t" in named("lagrangian", "mass_matrix", "force", "residual"),
@@ -179,7 +179,7 @@ def _facts_of_arrays(derivation: Derivation) -> dict[str, Any]:
     }
 
 
-def _engine(problem: Problem) -> dict[str, Any]:
+def _engine_facts(problem: Problem) -> dict[str, Any]:
     """The default solver of a motion, the form in which it evaluates the equations, and the cost of that."""
     derivation, refusal = problem.derivation, choose(problem).refusal
     if problem.system.touches and MachineCode().refuses(problem) is None:  # however large: arrays do not jump
@@ -199,7 +199,7 @@ def _engine(problem: Problem) -> dict[str, Any]:
     return {"solver": solver, "path": "scalar", "reason": "", **costs}
 
 
-def _borders(problem: Problem, inputs: tuple[str, ...]) -> dict[str, Any]:
+def _border_facts(problem: Problem, inputs: tuple[str, ...]) -> dict[str, Any]:
     """The borders and the narrow features of the accelerations, each by what it is and which inputs it reads."""
     derivation, n = problem.derivation, problem.derivation.layout.size
     try:
@@ -238,7 +238,7 @@ def _count_names(names: tuple[str, ...]) -> str:
     return f"{len(names)}: {join_names(list(dict.fromkeys(names)), _LISTED)}"
 
 
-def _pattern(parts: Program, n: int) -> str:
+def _pattern_kind(parts: Program, n: int) -> str:
     """Diagonal, block-diagonal or dense: the connected parts of the graph of entries that are not zero."""
     filled = np.array([[parts.constant(n * i + j) != 0 for j in range(n)] for i in range(n)])
     if not (filled & ~np.eye(n, dtype=bool)).any():

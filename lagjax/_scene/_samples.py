@@ -97,7 +97,7 @@ def samples(
     if hold not in HOLDS:
         raise ValueError(f"hold={hold!r} is not known. It is one of 'zero', 'linear', 'cubic' and 'band'.")
     knots, values = _check_samples(knots, values, hold)
-    functions = {"zero": _zero, "linear": _linear, "cubic": _cubic, "band": _band}
+    functions = {"zero": _held_value, "linear": _linear_value, "cubic": _cubic_value, "band": _band_limited_value}
     return functools.partial(functions[hold], knots, values)
 
 
@@ -145,7 +145,7 @@ def _require_increasing(knots: np.ndarray) -> None:
 def unevenly_spaced(knots: np.ndarray, name: str) -> str | None:
     """A sentence for instants (K,) that "band" cannot take, because they are not evenly spaced."""
     knots = knots if knots.dtype.kind == "f" else knots.astype(float)
-    steps, (spacing, tolerance) = np.diff(knots), _spacing(knots[0], knots[-1], len(knots))
+    steps, (spacing, tolerance) = np.diff(knots), _mean_spacing(knots[0], knots[-1], len(knots))
     i = int(np.argmax(np.abs(steps - spacing)))
     if abs(steps[i] - spacing) <= tolerance:
         return None
@@ -155,7 +155,7 @@ def unevenly_spaced(knots: np.ndarray, name: str) -> str | None:
     )
 
 
-def _spacing(first, last, count: int) -> tuple:
+def _mean_spacing(first, last, count: int) -> tuple:
     """The mean distance of instants, and how far from it that of two neighbours may be where they are even."""
     mean, eps = (last - first) / (count - 1), np.finfo(first.dtype).eps
     return mean, _UNEVEN * mean + 4 * eps * (abs(first) + abs(last))
@@ -179,46 +179,46 @@ def continued(values: np.ndarray, count: int, hold: str) -> np.ndarray:
 
 
 @jax.jit
-def _zero(knots, values, t):
+def _held_value(knots, values, t):
     t = jnp.asarray(t, knots.dtype)
-    i = _locate(knots, t, closed=False)
-    (v,) = _window(values, i, 1)
+    i = _locate_knots(knots, t, closed=False)
+    (v,) = _table_window(values, i, 1)
     return jnp.where(_expand_like(i < 0, v), jnp.nan, v)
 
 
 @jax.jit
-def _linear(knots, values, t):
-    t, (i, inside) = jnp.asarray(t, knots.dtype), _piece(knots, t)
-    (x0, x1), (v0, v1) = _window(knots, i, 2), _window(values, i, 2)
+def _linear_value(knots, values, t):
+    t, (i, inside) = jnp.asarray(t, knots.dtype), _piece_index(knots, t)
+    (x0, x1), (v0, v1) = _table_window(knots, i, 2), _table_window(values, i, 2)
     slope = jnp.where(_expand_like(inside, v0), (v1 - v0) / _expand_like(x1 - x0, v0), jnp.nan)
     return v0 + slope * _expand_like(t - x0, v0)
 
 
 @jax.jit
-def _cubic(knots, values, t):
-    t, (i, inside) = jnp.asarray(t, knots.dtype), _piece(knots, t)
-    (x0, x1), (v0, v1) = _window(knots, i, 2), _window(values, i, 2)
+def _cubic_value(knots, values, t):
+    t, (i, inside) = jnp.asarray(t, knots.dtype), _piece_index(knots, t)
+    (x0, x1), (v0, v1) = _table_window(knots, i, 2), _table_window(values, i, 2)
     step, s = _expand_like(x1 - x0, v0), _expand_like(t - x0, v0)
     chord = (v1 - v0) / step
-    m0, m1 = _slopes(knots, values, i, chord)
+    m0, m1 = _end_slopes(knots, values, i, chord)
     second, third = (3.0 * chord - 2.0 * m0 - m1) / step, (m0 + m1 - 2.0 * chord) / (step * step)
     m0 = jnp.where(_expand_like(inside, v0), m0, jnp.nan)  # and so is the slope of u
     return v0 + s * (m0 + s * (second + s * third))
 
 
 @jax.jit
-def _band(knots, values, t):
-    t, (i, inside) = jnp.asarray(t, knots.dtype), _piece(knots, t)
-    (x0, x1), count = _window(knots, i, 2), len(knots)
-    (begin,), (end,) = (_window(knots, jnp.full_like(i, k), 1) for k in (0, count - 1))
-    spacing, tolerance = _spacing(begin, end, count)
+def _band_limited_value(knots, values, t):
+    t, (i, inside) = jnp.asarray(t, knots.dtype), _piece_index(knots, t)
+    (x0, x1), count = _table_window(knots, i, 2), len(knots)
+    (begin,), (end,) = (_table_window(knots, jnp.full_like(i, k), 1) for k in (0, count - 1))
+    spacing, tolerance = _mean_spacing(begin, end, count)
     inside &= abs(x1 - x0 - spacing) <= tolerance  # of known knots that was checked
     j = i[..., None] + np.arange(1 - _HALF, _HALF + 1, dtype=np.int32)
     # Inside the last two terms are zero; beyond an end they reflect.
-    (first,), (last,) = (_window(values, jnp.full_like(j, k), 1) for k in (0, count - 1))
-    (v,), (before,), (behind,) = (_window(values, at, 1) for at in (j, -j, 2 * (count - 1) - j))
+    (first,), (last,) = (_table_window(values, jnp.full_like(j, k), 1) for k in (0, count - 1))
+    (v,), (before,), (behind,) = (_table_window(values, at, 1) for at in (j, -j, 2 * (count - 1) - j))
     v = v + (first - before) + (last - behind)
-    coefficients = jnp.tensordot(v, _polynomials().astype(knots.dtype), axes=((i.ndim,), (1,)))
+    coefficients = jnp.tensordot(v, _weight_polynomials().astype(knots.dtype), axes=((i.ndim,), (1,)))
     total = [coefficients[..., d] for d in range(_DEGREE + 1)]
     c = _expand_like(2.0 * (t - x0) / (x1 - x0) - 1.0, total[0])
     total[1] = jnp.where(_expand_like(inside, total[1]), total[1], jnp.nan)
@@ -226,7 +226,7 @@ def _band(knots, values, t):
 
 
 @functools.cache
-def _polynomials() -> np.ndarray:
+def _weight_polynomials() -> np.ndarray:
     """The weight of sample i − 15 + k in the piece from sample i on, by powers of c = 2 s − 1 in [−1, 1], (10, 32)."""
     # They interpolate at Chebyshev's points with both ends, so that u passes through its samples.
     nodes = -np.cos(np.pi * np.arange(_DEGREE + 1) / _DEGREE)
@@ -236,19 +236,19 @@ def _polynomials() -> np.ndarray:
     return np.linalg.solve(np.vander(nodes, increasing=True), weights)
 
 
-def _piece(knots, t):
+def _piece_index(knots, t):
     """The piece that a time is on, and whether that is one of those between two knots."""
-    i = _locate(knots, jnp.asarray(t, knots.dtype), closed=True)
+    i = _locate_knots(knots, jnp.asarray(t, knots.dtype), closed=True)
     return i, (i >= 0) & (i < len(knots) - 1)
 
 
-def _slopes(knots, values, i, chord):
+def _end_slopes(knots, values, i, chord):
     """The slopes at both ends of piece i: of the parabolas through three samples."""
     count = len(knots)
     if count == 2:
         return chord, chord
     size = min(count, 4)
-    x, v = _window(knots, i - 1, size), _window(values, i - 1, size)
+    x, v = _table_window(knots, i - 1, size), _table_window(values, i - 1, size)
     steps = [_expand_like(b - a, v[0]) for a, b in itertools.pairwise(x)]
     chords = [(b - a) / step for (a, b), step in zip(itertools.pairwise(v), steps, strict=True)]
 
@@ -265,7 +265,7 @@ def _slopes(knots, values, i, chord):
     return m0, m1
 
 
-def _window(table, start, size: int) -> list:
+def _table_window(table, start, size: int) -> list:
     """Entries `start`, `start` + 1, … of a table, `size` of them; those that fit, where these would stick out."""
     where = start.ndim
     offsets = tuple(range(where, where + table.ndim))
@@ -282,33 +282,33 @@ def _expand_like(x, v):
 # ---- where a time is -------------------------------------------------------------------------------------------------
 
 
-def _locate(knots, t, closed: bool):
+def _locate_knots(knots, t, closed: bool):
     """Knots that are at most t, less one, of int32; with `closed` the last knot belongs to the last piece."""
     return _locate_p.bind(jnp.asarray(knots), t, closed=closed)
 
 
-def _search(knots, t, *, closed):
+def _search_knots(knots, t, *, closed):
     i = jnp.searchsorted(knots, t, side="right").astype(np.int32) - 1
     if closed:
         i = jnp.where(t == knots[-1], len(knots) - 2, i)
     return jnp.where(jnp.isnan(t), -1, i).astype(np.int32)
 
 
-def _batch(arguments, axes, *, closed):
+def _batch_search(arguments, axes, *, closed):
     knots, t = arguments
     if axes[0] is None:  # knots that all share
         return _locate_p.bind(knots, t, closed=closed), axes[1]
-    return jax.vmap(functools.partial(_search, closed=closed), in_axes=tuple(axes))(knots, t), 0
+    return jax.vmap(functools.partial(_search_knots, closed=closed), in_axes=tuple(axes))(knots, t), 0
 
 
-def _derivative(primals, tangents, *, closed):
+def _search_jvp(primals, tangents, *, closed):
     found = _locate_p.bind(*primals, closed=closed)
     return found, ad.Zero(jax.typeof(found).to_tangent_aval())
 
 
 _locate_p = VaryingPrimitive("lagjax_locate")  # `_tracing.lowering._rules` knows it by this name
-_locate_p.def_impl(jax.jit(_search, static_argnames="closed"))
+_locate_p.def_impl(jax.jit(_search_knots, static_argnames="closed"))
 _locate_p.def_abstract_eval(lambda knots, t, *, closed: ShapedArray(t.shape, np.dtype(np.int32)))
-mlir.register_lowering(_locate_p, mlir.lower_fun(_search, multiple_results=False))
-ad.primitive_jvps[_locate_p] = _derivative
-batching.primitive_batchers[_locate_p] = _batch
+mlir.register_lowering(_locate_p, mlir.lower_fun(_search_knots, multiple_results=False))
+ad.primitive_jvps[_locate_p] = _search_jvp
+batching.primitive_batchers[_locate_p] = _batch_search

@@ -456,16 +456,16 @@ class System(eqx.Module):
     def _role_shapes(self, roles: list[str], layout: Layout, params: PyTree) -> tuple:
         return tuple(self._output_shapes(role, layout, params) for role in roles)
 
-    def _given(self, *roles: str) -> list[str]:
+    def _given_roles(self, *roles: str) -> list[str]:
         return [role for role in roles if getattr(self, role) is not None]
 
     @property
     def _constraint_roles(self) -> list[str]:
-        return self._given("constraints", "velocity_constraints")
+        return self._given_roles("constraints", "velocity_constraints")
 
     @property
     def _contact_roles(self) -> list[str]:
-        return self._given("contacts", "one_way")
+        return self._given_roles("contacts", "one_way")
 
     @property
     def _multiplier_roles(self) -> list[str]:
@@ -514,8 +514,8 @@ class System(eqx.Module):
             if value is None and quantity is Motion.nearest_consistent:
                 numbers, flat = eqx.filter(params, eqx.is_array_like), (layout.flatten(q), layout.flatten(qdot), t)
                 terms = derivation_of(self, layout, params).term_sizes(*flat, numbers)
-                return _evaluate(self, quantity, q, qdot, t, params, terms=terms)
-            return _evaluate(self, quantity, q, qdot, t, params, **more) if value is None else value
+                return _evaluate_motion(self, quantity, q, qdot, t, params, terms=terms)
+            return _evaluate_motion(self, quantity, q, qdot, t, params, **more) if value is None else value
 
         given = self, q, qdot, t, params, more
         # A tracer that a function closes over would be lost in doubles.
@@ -629,7 +629,7 @@ def _coefficients(contacts, one_way, restitution, friction, slip) -> tuple:
             "friction needs the sliding velocity at every contact: give slip=lambda q, qdot: ... in the structure of "
             "the gaps."
         )
-    return tuple(x if callable(x) else _constant(x) for x in given.values())
+    return tuple(x if callable(x) else _constant_function(x) for x in given.values())
 
 
 def require_coefficients(system: "System", params: PyTree) -> None:
@@ -650,7 +650,7 @@ def _require_range(name: str, values: PyTree) -> None:
             raise ValueError(f"restitution must be between 0 and 1: more would add energy; got {value}.")
 
 
-def _constant(value) -> Callable:
+def _constant_function(value) -> Callable:
     """A function that gives a value which it closes over: by that, editions of functions tell them apart."""
     return lambda: value
 
@@ -696,7 +696,7 @@ def replace_functions(system: System, functions: dict[str, Function | None], pat
 
 
 @eqx.filter_jit
-def _evaluate(system: System, quantity: Callable, q, qdot, t, params, **more):
+def _evaluate_motion(system: System, quantity: Callable, q, qdot, t, params, **more):
     """One of `Motion`'s functions, compiled whole: XLA would take seconds to prepare its operations one by one."""
     layout = Layout.from_state(q, qdot)
     numbers, derivation = eqx.filter(params, eqx.is_array), derivation_of(system, layout, params)

@@ -58,7 +58,7 @@ class Animation:
     def _repr_html_(self) -> str | None:
         """The film itself, for notebooks; None where it cannot be made."""
         try:
-            return self._page()
+            return self._film_html()
         except Exception:  # a display must not fail
             return None
 
@@ -79,17 +79,17 @@ class Animation:
         """
         suffix = Path(path).suffix.lower()
         if suffix == ".gif":
-            self._gif(path)
+            self._write_gif(path)
         elif suffix in _VIDEO:
-            self._video(path)
+            self._write_video(path)
         elif suffix in _PAGE:
             head = '<!doctype html><meta charset="utf-8"><title>A motion</title>'
-            Path(path).write_text(head + self._page(), encoding="utf-8")
+            Path(path).write_text(head + self._film_html(), encoding="utf-8")
         else:
             known = f".gif, {', '.join(_VIDEO)}, .html"
             raise ValueError(f"The suffix of {str(path)!r} names no film: write {known}; got {suffix!r}.")
 
-    def _gif(self, path) -> None:
+    def _write_gif(self, path) -> None:
         """Write the pictures one after another, so that no more than one of them is in memory in its full colours."""
         from PIL import Image  # comes with matplotlib
 
@@ -104,8 +104,8 @@ class Animation:
         rest = map(picture, range(1, count))
         picture(0).save(path, format="GIF", save_all=True, append_images=rest, duration=10 * hundredths, loop=0)
 
-    def _video(self, path) -> None:
-        matplotlib, program = _matplotlib(), _ffmpeg()
+    def _write_video(self, path) -> None:
+        matplotlib, program = _import_matplotlib(), _find_ffmpeg()
         if program is None:
             raise RuntimeError(
                 "To write a video takes the program ffmpeg, which is not there: install it, or pip install "
@@ -114,9 +114,9 @@ class Animation:
         with matplotlib.rc_context({"animation.ffmpeg_path": program}):
             self._film().save(path, writer=matplotlib.animation.FFMpegWriter(fps=self.fps), dpi=_DPI)
 
-    def _page(self) -> str:
+    def _film_html(self) -> str:
         """The film as HTML: a video where ffmpeg is there, else pictures and a few lines of JavaScript."""
-        matplotlib, program = _matplotlib(), _ffmpeg()
+        matplotlib, program = _import_matplotlib(), _find_ffmpeg()
         # Beyond its limit matplotlib leaves frames out, or the whole video.
         options = {"animation.embed_limit": _LARGEST_PAGE, "savefig.dpi": _DPI}
         with matplotlib.rc_context(options | ({} if program is None else {"animation.ffmpeg_path": program})):
@@ -125,19 +125,19 @@ class Animation:
     def _film(self):
         figure, show, count = self._figure(self.fps)
         options = dict(frames=count, init_func=lambda: (), interval=1000 / self.fps, cache_frame_data=False)
-        return _matplotlib().animation.FuncAnimation(figure, show, **options)
+        return _import_matplotlib().animation.FuncAnimation(figure, show, **options)
 
     def _figure(self, fps: float) -> tuple[Any, Callable, int]:
         """The figure, a function that sets it to frame i, and how many frames there are."""
-        matplotlib, times = _matplotlib(), self.times(fps)
+        matplotlib, times = _import_matplotlib(), self.times(fps)
         positions, traces = self.positions(times), self._traces(times)
-        limits = _limits([*positions.values(), *(path for _, _, path in traces)])
-        figure = matplotlib.figure.Figure(figsize=_size(*limits), layout="constrained", dpi=_DPI)
+        limits = _axis_limits([*positions.values(), *(path for _, _, path in traces)])
+        figure = matplotlib.figure.Figure(figsize=_figure_size(*limits), layout="constrained", dpi=_DPI)
         matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
-        show, moving = _draw_film(_axes(figure, *limits), positions, times, traces, max(1, round(TRAIL * fps)))
+        show, moving = _draw_film(_build_axes(figure, *limits), positions, times, traces, max(1, round(TRAIL * fps)))
         figure.draw_without_rendering()
         figure.set_layout_engine("none")  # it is laid out: to do so for every frame takes most of the time
-        _keep_the_rest(figure, moving)
+        _cache_background(figure, moving)
         return figure, show, len(times)
 
     def _traces(self, times: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
@@ -258,9 +258,9 @@ def _draw_film(ax, positions: dict[str, np.ndarray], times: np.ndarray, traces, 
             lines.append((line, member))
     for name, t, path in traces:
         seen = np.searchsorted(forward * t, forward * times, side="right")  # of the path, at every frame
-        faded.append((_trace(ax, space), t, path, seen, colors[name]))
+        faded.append((_add_trace(ax, space), t, path, seen, colors[name]))
     # Above the scene; at a height of its own, as matplotlib looks for none of a title that is hidden.
-    clock = ax.set_title(f"t = {times[-1]:.{_digits(times)}f}", loc="left", y=1.0, fontsize="medium")
+    clock = ax.set_title(f"t = {times[-1]:.{_time_digits(times)}f}", loc="left", y=1.0, fontsize="medium")
 
     def show(i: int):
         for line, member in lines:
@@ -270,14 +270,14 @@ def _draw_film(ax, positions: dict[str, np.ndarray], times: np.ndarray, traces, 
             collection.set_segments(np.stack([path[recent][:-1], path[recent][1:]], axis=1))
             age = (t[recent][1:] - begin) / (times[i] - begin if i else 1.0)
             collection.set_color([(color, a * opacity) for a in np.clip(age, 0.0, 1.0)])
-        clock.set_text(f"t = {times[i]:.{_digits(times)}f}")
+        clock.set_text(f"t = {times[i]:.{_time_digits(times)}f}")
         return ()
 
     above = [] if space else [ax.spines["left"], ax.spines["bottom"]]  # these stand still, and on top
     return show, [clock, *above, *(artist for artist, *_ in lines + faded)]
 
 
-def _keep_the_rest(figure, moving: list) -> None:
+def _cache_background(figure, moving: list) -> None:
     """Draw all but the `moving` artists once: axes take ten times as long, and `blit` is for windows only."""
     draw_all, kept = figure.draw, []
     order = figure.axes[0].get_children()
@@ -300,7 +300,7 @@ def _keep_the_rest(figure, moving: list) -> None:
     figure.draw = draw
 
 
-def _axes(figure, low: np.ndarray, high: np.ndarray):
+def _build_axes(figure, low: np.ndarray, high: np.ndarray):
     ax = figure.add_subplot(projection="3d" if len(low) == 3 else None)
     ax.set(**{f"{axis}lim": ends for axis, *ends in zip("xyz", low, high, strict=False)})
     if len(low) == 3:
@@ -318,7 +318,7 @@ def _axes(figure, low: np.ndarray, high: np.ndarray):
     return simplify_axes(ax)
 
 
-def _limits(points: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def _axis_limits(points: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """The box of all points, a twentieth wider, and no side less than a tenth of the longest."""
     every = np.concatenate([array.reshape(-1, array.shape[-1]) for array in points])
     every = every[np.isfinite(every).all(axis=1)]
@@ -329,7 +329,7 @@ def _limits(points: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return middle - half, middle + half
 
 
-def _size(low: np.ndarray, high: np.ndarray) -> tuple[float, float]:
+def _figure_size(low: np.ndarray, high: np.ndarray) -> tuple[float, float]:
     """Width and height of the figure in inches, even numbers of dots, as videos need them."""
     if len(low) == 3:
         return _SIZE, _SIZE
@@ -337,22 +337,22 @@ def _size(low: np.ndarray, high: np.ndarray) -> tuple[float, float]:
     return _SIZE * max(width, 0.5), round(_SIZE * max(height, 0.4) * _DPI / 2) * 2 / _DPI
 
 
-def _trace(ax, space: bool):
+def _add_trace(ax, space: bool):
     """An empty line whose pieces have colours of their own."""
     if space:
         from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
         return ax.add_collection3d(Line3DCollection([np.zeros((2, 3))], linewidths=1.2), autolim=False)
-    return ax.add_collection(_matplotlib().collections.LineCollection([], linewidths=1.2), autolim=False)
+    return ax.add_collection(_import_matplotlib().collections.LineCollection([], linewidths=1.2), autolim=False)
 
 
-def _digits(times: np.ndarray) -> int:
+def _time_digits(times: np.ndarray) -> int:
     """Decimal places that tell frames apart, up to 6."""
     step = abs(times[1] - times[0]) if len(times) > 1 else 1.0
     return int(np.clip(np.ceil(-np.log10(10 * step)), 0, 6))
 
 
-def _ffmpeg() -> str | None:
+def _find_ffmpeg() -> str | None:
     if program := shutil.which("ffmpeg"):
         return program
     try:
@@ -363,6 +363,6 @@ def _ffmpeg() -> str | None:
         return None
 
 
-def _matplotlib() -> Any:
+def _import_matplotlib() -> Any:
     parts = "animation", "backends.backend_agg", "collections", "figure"
     return import_package("animate", "matplotlib", "lagjax[examples]", *parts)

@@ -83,12 +83,12 @@ def write_c(system: "System", layout: Layout, params: PyTree, inputs: PyTree, na
         system, params = drive_scene(system, held_inputs), Driven(params, inputs)
     try:
         derivation = derivation_of(system, layout, params).with_numbers().lowered
-        return _Source(derivation, name, CNumbers(dtype), places).text()
+        return _SceneSource(derivation, name, CNumbers(dtype), places).text()
     except Unlowerable as reason:
         raise ValueError(f"This scene has no scalar program, and therefore no C: {reason}.") from None
 
 
-class _Source:
+class _SceneSource:
     """The text of a scene in C, whose functions begin with `name`."""
 
     def __init__(self, derivation: Derivation, name: str, numbers: CNumbers, places: dict[str, Sequence[str]]):
@@ -97,36 +97,36 @@ class _Source:
         self.arrays = [array for array in ("params", "inputs") if places[array]]
 
     def text(self) -> str:
-        functions = [self._write(what, line, says) for what, (line, says) in self._lines().items()]
-        functions.append(self._step())
+        functions = [self._write_quantity(what, line, says) for what, (line, says) in self._write_functions().items()]
+        functions.append(self._write_step())
         helpers = self.numbers.helpers("".join(functions))
-        head = _HEAD.format(version=VERSION, order=self._order())
+        head = _HEAD.format(version=VERSION, order=self._argument_order())
         return "\n".join([head, *helpers, *functions])
 
-    def _order(self) -> str:
+    def _argument_order(self) -> str:
         rows = [f"   {'q, qdot, qddot':16s} {', '.join(self.places['q'])}"]
         rows += [f"   {array:16s} {', '.join(self.places[array])}" for array in self.arrays]
         return "\n".join(rows).replace("*/", "* /")
 
-    def _lines(self) -> dict[str, tuple[StraightLine, str]]:
+    def _write_functions(self) -> dict[str, tuple[StraightLine, str]]:
         """The functions: the line of each, and a comment."""
         of, n = self.derivation, self.n
         lines = {
             "acceleration": (_settle(of.accelerations.program.complete.line), f"qddot[{n}]; NaN where M is singular"),
             "mass_matrix": (of.program("mass_matrix").line, f"M, {n} rows of {n}"),
-            "energy": (_energy(of).line, "p qdot - L, one number"),
+            "energy": (_energy_line(of).line, "p qdot - L, one number"),
         }
         if of.accelerations.projected is not None:
             says = f"q and qdot, {2 * n} numbers, after one Newton step to the constraints"
             lines["project"] = of.accelerations.projected.line, says
         return lines
 
-    def _write(self, what: str, line: StraightLine, says: str) -> str:
+    def _write_quantity(self, what: str, line: StraightLine, says: str) -> str:
         kind = f"const {self.numbers.type}"
         arguments = {"q": f"{kind} *", "qdot": f"{kind} *", "t": kind} | {x: f"{kind} *" for x in self.arrays}
-        return f"/* {says} */\n{write_function(f'{self.name}_{what}', line, arguments, self._read, self.numbers)}"
+        return f"/* {says} */\n{write_function(f'{self.name}_{what}', line, arguments, self._read_input, self.numbers)}"
 
-    def _read(self, i: int) -> str:
+    def _read_input(self, i: int) -> str:
         """Input i of a line, in C."""
         n, count = self.n, len(self.places["params"])
         if i < 2 * n + 1:
@@ -134,7 +134,7 @@ class _Source:
         i -= 2 * n + 1
         return f"params[{i}]" if i < count else f"inputs[{i - count}]"
 
-    def _step(self) -> str:
+    def _write_step(self) -> str:
         of = self.derivation
         if of.borders is not None and of.borders.switches:
             return _NO_STEP.format(name=self.name)
@@ -153,7 +153,7 @@ def _settle(line: StraightLine) -> StraightLine:
     return eliminate_dead_code(graph, [graph.apply("select", singular, x, graph.number(np.nan)) for x in values])
 
 
-def _energy(derivation: Derivation) -> Program:
+def _energy_line(derivation: Derivation) -> Program:
     parts, n = derivation.program("momentum", "lagrangian"), derivation.layout.size
 
     def energy(*scalars):

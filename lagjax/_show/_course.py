@@ -67,11 +67,11 @@ def wrap_curve(x: np.ndarray, y: np.ndarray, of_x: float | None, of_y: float | N
     """A curve with x and y in −P/2 … P/2 for a period P each, None without one: it leaves at an edge, and comes in at
     the other after a gap."""
     if of_x is not None:
-        x, y = _wrap_one(x, y, of_x)
-    return (x, y) if of_y is None else _wrap_one(y, x, of_y)[::-1]
+        x, y = _wrap_angle(x, y, of_x)
+    return (x, y) if of_y is None else _wrap_angle(y, x, of_y)[::-1]
 
 
-def _wrap_one(angle: np.ndarray, other: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
+def _wrap_angle(angle: np.ndarray, other: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
     turns = np.floor(angle / period + 0.5)
     steps = np.nan_to_num(np.diff(turns))
     left = np.flatnonzero(steps)

@@ -55,11 +55,11 @@ class Equations:
         of = "M q'' = F + G^T lambda, G q'' = gamma" if self.constraints else "M q'' = F"
         lines = [f"{of}; M is symmetric, and what is not listed is 0.", ""]
         lines += [f"{name} = {formula}" for name, formula in self.parts.items()]
-        for title, formulas in self._tables().items():
-            lines += [f"{title}[{_key(key)}] = {formula}" for key, formula in formulas.items()]
+        for title, formulas in self._matrix_tables().items():
+            lines += [f"{title}[{_entry_key(key)}] = {formula}" for key, formula in formulas.items()]
         return "\n".join(lines)
 
-    def _tables(self) -> dict[str, dict]:
+    def _matrix_tables(self) -> dict[str, dict]:
         return {
             "M": self.mass_matrix, "F": self.force, "f": self.constraints, "G": self.jacobian, "gamma": self.gamma,
         }  # fmt: skip
@@ -68,7 +68,7 @@ class Equations:
         return f"$$\n{self.latex}\n$$" if self.latex else self.note
 
 
-def _key(key: str | tuple[str, str]) -> str:
+def _entry_key(key: str | tuple[str, str]) -> str:
     return key if isinstance(key, str) else ", ".join(key)
 
 
@@ -92,17 +92,17 @@ def write_equations(system: "System", layout: Layout, params: PyTree, inputs: Py
             "they contain."
         )
     found = Formulas(line, 2 * layout.size + 1)
-    sums: dict[str, Any] = dict(zip(quantities, _split(derivation, found, quantities), strict=True))
-    return _Page(found, sums, input_names(layout.names, numbers), names).equations()
+    sums: dict[str, Any] = dict(zip(quantities, _split_name(derivation, found, quantities), strict=True))
+    return _FormulaPage(found, sums, input_names(layout.names, numbers), names).equations()
 
 
-def _split(derivation: Derivation, found: Formulas, quantities: tuple[str, ...]) -> list[np.ndarray]:
+def _split_name(derivation: Derivation, found: Formulas, quantities: tuple[str, ...]) -> list[np.ndarray]:
     outputs = np.empty(len(found.outputs), object)
     outputs[:] = found.outputs
     return list(derivation.split_outputs(quantities, outputs).values())
 
 
-class _Page:
+class _FormulaPage:
     """The formulas of a scene, and how they are written."""
 
     def __init__(self, formulas: Formulas, sums: dict[str, np.ndarray], names: list[Name], constraints: list[str]):

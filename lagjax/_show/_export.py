@@ -22,7 +22,7 @@ def dataset(trajectory, units: PyTree = None, time_unit: str | None = None):
     xarray = import_package("to_xarray()", "xarray", "xarray")
     require_numbers(trajectory, "to_xarray() copies")
     members = _axis_names(np.ndim(trajectory.ok))
-    of_q, of_qdot = _units(trajectory.q, units, time_unit)
+    of_q, of_qdot = _leaf_units(trajectory.q, units, time_unit)
     variables: dict[str, tuple] = {"ok": (members, np.asarray(trajectory.ok))}
     trees = [("q", trajectory.q, of_q), ("qdot", trajectory.qdot, of_qdot)]
     if trajectory.contacts is not None:
@@ -60,7 +60,7 @@ def frame(trajectory, units: PyTree = None, time_unit: str | None = None):
         places = [place.ravel() for place in np.indices((*members.batch, trajectory.ts.shape[-1]))[:-1]]
         index = pandas.MultiIndex.from_arrays([*places, index], names=[*_axis_names(len(members.batch)), "t"])
     table = pandas.DataFrame(columns, index=index)
-    of_q, of_qdot = _units(trajectory.q, units, time_unit)
+    of_q, of_qdot = _leaf_units(trajectory.q, units, time_unit)
     per_leaf = [math.prod(shape) for shape in members.layout.shapes]
     spread = [unit for of in (of_q, of_qdot) for unit, size in zip(of, per_leaf, strict=True) for _ in range(size)]
     known = dict(zip([*columns][: len(spread)], spread, strict=True)) | {"t": time_unit}
@@ -117,7 +117,7 @@ def _axis_names(rank: int) -> tuple[str, ...]:
     return ("member",) if rank == 1 else tuple(f"member_{axis}" for axis in range(rank))
 
 
-def _units(tree: PyTree, units: PyTree, time_unit: str | None) -> tuple[list, list]:
+def _leaf_units(tree: PyTree, units: PyTree, time_unit: str | None) -> tuple[list, list]:
     """The unit of every leaf of q, and of its velocity; None where there is none."""
     if time_unit is not None and not isinstance(time_unit, str):
         raise TypeError(f"time_unit must be text, as 's' is; got {time_unit!r}.")

@@ -87,11 +87,11 @@ class FormulaWriter:
 
     def write(self, x: Sum) -> str:
         """A sum, positive terms first."""
-        ordered = sorted(x.items(), key=lambda term: (term[1] < 0, self._order(term[0])))
+        ordered = sorted(x.items(), key=lambda term: (term[1] < 0, self._term_rank(term[0])))
         text = ""
         for product, c in ordered:
             sign = " - " if c < 0 else " + "
-            term = self._product(product, abs(c))
+            term = self._product_text(product, abs(c))
             text += sign + term if text else ("-" if c < 0 else "") + term
         return text or "0"
 
@@ -99,17 +99,17 @@ class FormulaWriter:
         """The formula that the name of a part stands for."""
         of = self.formulas.atoms[atom]
         sums = [self.write(dict(x)) for x in of.operands]
-        return sums[0] if of.kind == "sum" else self.style.call(self._called(of), sums, "")
+        return sums[0] if of.kind == "sum" else self.style.call(self._function_call(of), sums, "")
 
     @staticmethod
-    def _called(atom) -> str:
+    def _function_call(atom) -> str:
         return atom.kind + (str(abs(atom.position) % 1000) if atom.kind in ("take", "locate") else "")
 
-    def _product(self, product: Product, c: float) -> str:
-        above, below = _number(c) if math.isfinite(c) else (_NOT_FINITE[str(c)][self.style is LATEX], "1")
-        factors = sorted(product, key=lambda of: self._place(of[0]))
-        upper = [above] * (above != "1") + [self._factor(atom, p) for atom, p in factors if p > 0]
-        lower = [below] * (below != "1") + [self._factor(atom, -p) for atom, p in factors if p < 0]
+    def _product_text(self, product: Product, c: float) -> str:
+        above, below = _number_text(c) if math.isfinite(c) else (_NOT_FINITE[str(c)][self.style is LATEX], "1")
+        factors = sorted(product, key=lambda of: self._factor_rank(of[0]))
+        upper = [above] * (above != "1") + [self._factor_text(atom, p) for atom, p in factors if p > 0]
+        lower = [below] * (below != "1") + [self._factor_text(atom, -p) for atom, p in factors if p < 0]
         times = self.style.times
         if not lower:
             return times.join(upper) or "1"
@@ -118,9 +118,9 @@ class FormulaWriter:
             bottom = f"({bottom})"
         return self.style.fraction(times.join(upper) or "1", bottom)
 
-    def _factor(self, atom: int, power: float) -> str:
+    def _factor_text(self, atom: int, power: float) -> str:
         of, style = self.formulas.atoms[atom], self.style
-        exponent = "" if power == 1 else _exponent(power, style)
+        exponent = "" if power == 1 else _exponent_text(power, style)
         if atom in self.parts:
             base = self.parts[atom]
         elif of.kind == "input":
@@ -133,9 +133,9 @@ class FormulaWriter:
         else:
             sums = [self.write(dict(x)) for x in of.operands]
             return (
-                style.root(style.call(self._called(of), sums, ""))
+                style.root(style.call(self._function_call(of), sums, ""))
                 if power == 0.5
-                else style.call(self._called(of), sums, exponent)
+                else style.call(self._function_call(of), sums, exponent)
             )
         if power == 0.5:
             return style.root(base)
@@ -143,13 +143,13 @@ class FormulaWriter:
 
     # ---- the order of a textbook ----
 
-    def _place(self, atom: int) -> tuple:
+    def _factor_rank(self, atom: int) -> tuple:
         """The place of a factor in a product."""
         of = self.formulas.atoms[atom]
         if of.kind == "input":
             name = self.names[of.position]
-            return name.place, *_rank(name.text)
-        inner = [self._place(a) for x in of.operands for product, _ in x for a, _ in product]
+            return name.place, *_symbol_rank(name.text)
+        inner = [self._factor_rank(a) for x in of.operands for product, _ in x for a, _ in product]
         largest = max((place[0] for place in inner), default=_PARAMETER)
         if atom in self.parts:
             return largest, 3, self.parts[atom]
@@ -158,20 +158,20 @@ class FormulaWriter:
             return largest, first[0] if largest == _PARAMETER else 2, first[1]
         return max(largest, _FUNCTION), of.kind != "sin", of.kind, atom
 
-    def _order(self, product: Product) -> tuple:
+    def _term_rank(self, product: Product) -> tuple:
         """The place of a term in a sum, by its factors: those with velocities stand behind others, constants last."""
-        places = sorted(self._place(atom) for atom, _ in product)
+        places = sorted(self._factor_rank(atom) for atom, _ in product)
         return not product, bool(places) and places[-1][0] == _VELOCITY, [str(place) for place in places]
 
 
 _MASSES = re.compile(r"(m|M|J|I|mass|inertia)[_\d]*")
 
 
-def _rank(name: str) -> tuple[int, str]:
+def _symbol_rank(name: str) -> tuple[int, str]:
     return (0 if _MASSES.fullmatch(name) else 1), name
 
 
-def _number(c: float) -> tuple[str, str]:
+def _number_text(c: float) -> tuple[str, str]:
     """A positive number above and below the line of a fraction: 0.5, or 1 and 3."""
     simple = Fraction(c).limit_denominator(_LARGEST_DENOMINATOR)
     with np.errstate(over="ignore", under="ignore"):
@@ -187,8 +187,8 @@ def _number(c: float) -> tuple[str, str]:
     return repr(c), "1"
 
 
-def _exponent(power: float, style: Style) -> str:
-    above, below = _number(power)
+def _exponent_text(power: float, style: Style) -> str:
+    above, below = _number_text(power)
     text = above if below == "1" else f"{above}/{below}"
     halves = Fraction(power).limit_denominator(_LARGEST_DENOMINATOR)
     if halves.denominator > 1 and float(halves) == power:

@@ -49,14 +49,14 @@ def trajectory_html(trajectory) -> str | None:
     leaves = [*jax.tree.leaves(trajectory.q), trajectory.ts, trajectory.result._value, trajectory.end.t]
     if not all(map(is_known, leaves)) or not leaves[0].size:
         return None
-    return cell(repr(trajectory), lambda figure: _draw(figure, trajectory))
+    return cell(repr(trajectory), lambda figure: _draw_curves(figure, trajectory))
 
 
-def _draw(figure, trajectory) -> None:
+def _draw_curves(figure, trajectory) -> None:
     codes = np.asarray(trajectory.result._value).ravel()
     members, ax = even_places(codes.size, MEMBERS), figure.subplots()
     layout, courses = courses_of(trajectory, members)
-    curves = [_shorten(course) for course in courses]
+    curves = [_thin_curve(course) for course in courses]
     for name, color, i in zip(layout.names, COLORS, range(COORDINATES), strict=False):
         draw_curves(ax, [join_curve(t, q[:, i]) for t, q in curves], color, name)
     if layout.size > COORDINATES:
@@ -77,7 +77,7 @@ def draw_curves(ax, curves: list, color: str, label: str | None = None, width: f
         ax.plot(*curve, label=None if k else label, **style)
 
 
-def _shorten(course: Course) -> tuple[np.ndarray, np.ndarray]:
+def _thin_curve(course: Course) -> tuple[np.ndarray, np.ndarray]:
     """The times (F,) and coordinates (F, n) of a curve; of many outputs those at some even times."""
     if len(course.t) <= OUTPUTS:
         return course.curve()[:2]

@@ -31,7 +31,7 @@ def summary(trajectory) -> str:
     leaves = jax.tree.leaves(essential, is_leaf=lambda leaf: leaf is None)
     if not all(hasattr(leaf, "shape") and hasattr(leaf, "dtype") for leaf in leaves):
         return eqx.tree_pformat(trajectory)
-    return "\n".join([_contents(trajectory), _span(trajectory), _verdict(trajectory)])
+    return "\n".join([_fields(trajectory), _describe_span(trajectory), _describe_verdict(trajectory)])
 
 
 def canonical_summary(trajectory) -> str:
@@ -65,7 +65,7 @@ def import_package(what: str, name: str, source: str, *parts: str) -> Any:
         raise ImportError(f"{what} needs the package {name}: pip install {source}.") from None
 
 
-def _contents(trajectory) -> str:
+def _fields(trajectory) -> str:
     batch = trajectory.result._value.shape
     members = f" of {' × '.join(map(str, batch))} members" if batch else ""
     modes = f"; modes {', '.join(trajectory.mode_names)}" if trajectory.mode_names else ""
@@ -87,11 +87,11 @@ def _outputs(ts) -> str:
     if not is_known(ts):
         return text
     # Under `jax.vmap` members may have times of their own.
-    start, end = (_range(np.asarray(ts)[..., place]) for place in (0, -1))
+    start, end = (_format_range(np.asarray(ts)[..., place]) for place in (0, -1))
     return f"t from {start} to {end} at {text}"
 
 
-def _span(trajectory) -> str:
+def _describe_span(trajectory) -> str:
     text, counts = _outputs(trajectory.ts), [trajectory.stats[name] for name in COUNTS]
     if not all(map(is_known, counts)):
         return f"{text}; the steps are being traced"
@@ -107,7 +107,7 @@ def _span(trajectory) -> str:
     return f"{text}, {counted}"
 
 
-def _verdict(trajectory) -> str:
+def _describe_verdict(trajectory) -> str:
     code, t_end = trajectory.result._value, trajectory.end.t
     if not (is_known(code) and is_known(t_end) and is_known(trajectory.ts)):
         return "the result is being traced"
@@ -136,7 +136,7 @@ def _events(trajectory) -> str:
     return f", by {', '.join(ended)}" if len(leaves) > 1 and ended else ""
 
 
-def _range(values: np.ndarray) -> str:
+def _format_range(values: np.ndarray) -> str:
     if values.size == 0:
         return "?"
     least, largest = f"{values.min():.6g}", f"{values.max():.6g}"

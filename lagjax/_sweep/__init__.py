@@ -268,8 +268,8 @@ def sweep(
     if executor is not None:
         require_executor(executor)
     axes, part = axes_of(over), require_part(settled.part)
-    place, compiled = _folder(settled.path, "store"), []
-    other = None if settled.extend is None else _folder(settled.extend, "extend")
+    place, compiled = _store_folder(settled.path, "store"), []
+    other = None if settled.extend is None else _store_folder(settled.extend, "extend")
     with precision(uses_doubles()):
         if not place.exists():
             begin(place, axes, description, settled.unit, compiled, other)
@@ -285,7 +285,7 @@ def sweep(
     return Sweep(place.path)
 
 
-def _folder(path: Any, name: str) -> Files:
+def _store_folder(path: Any, name: str) -> Files:
     if not isinstance(path, str | os.PathLike) or not str(path):
         raise TypeError(f"{name} must be the name of a folder, such as 'map.zarr'; got {path!r}.")
     return Files(Path(path).expanduser().absolute())

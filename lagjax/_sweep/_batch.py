@@ -80,7 +80,7 @@ class Batches:
         self._starts = {role: self._map_start(role, f) if callable(f) else None for role, f in roles.items()}
         self._axes = tuple(0 if self._starts[role] else None for role in ("q0", "qdot0", "params"))
         self._keep_all, self._keep_one = jax.jit(self._keep_vectorized), jax.jit(self._keep_member)
-        self._drift_all, self._tolerances = jax.jit(jax.vmap(self._drift_of, in_axes=(0, self._axes[2]))), None
+        self._drift_all, self._tolerances = jax.jit(jax.vmap(self._energy_drift, in_axes=(0, self._axes[2]))), None
         self._settings = None
 
     def __call__(self, points: dict[str, np.ndarray]) -> KeptResults:
@@ -106,7 +106,7 @@ class Batches:
             kept, _ = jax.eval_shape(self._keep_vectorized, motions.arrays, motions.params)
             return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(kept))
         except NOT_TRACEABLE:
-            (row,), _ = self._rows(motions)
+            (row,), _ = self._member_rows(motions)
             return sum(x.nbytes for x in (row or {}).values())
 
     def _compute_motions(self, points: dict[str, np.ndarray]) -> tuple["_BatchMotions", dict[int, str], dict[int, str]]:
@@ -116,11 +116,11 @@ class Batches:
         values = {role: f(points, complaints) if f else getattr(description, role) for role, f in starts}
         ts = values.pop("ts")
         if self._starts["ts"]:
-            ts, wrong = _sound_times(ts, complaints)
+            ts, wrong = _replace_bad_times(ts, complaints)
         run, crossings = run_batch(description, values, jnp.asarray(ts), self._axes)
         self._tolerances, self._settings = None if jumps(description.system) else run.tolerances, run.settings
         for_members = values["params"] if self._axes[2] == 0 else None
-        of_run = _arrays(run) | ({"ts": ts} if self._starts["ts"] else {})
+        of_run = _result_arrays(run) | ({"ts": ts} if self._starts["ts"] else {})
         return _BatchMotions(run, (of_run, crossings), for_members), complaints, wrong
 
     def _keep_results(self, motions: "_BatchMotions") -> _Kept:
@@ -157,17 +157,17 @@ class Batches:
         return start
 
     def _keep_vectorized(self, arrays: tuple, params: PyTree) -> tuple:
-        keep_member = lambda *of: (self._keep_member(*of), self._drift_of(*of))  # noqa: E731
+        keep_member = lambda *of: (self._keep_member(*of), self._energy_drift(*of))  # noqa: E731
         return jax.vmap(keep_member, in_axes=(0, self._axes[2]))(arrays, params)
 
     def _keep_member(self, arrays: tuple, params: PyTree) -> dict:
         run, crossings = arrays
         extras = {} if self.description.sections is None else {"crossings": crossings}
-        kept = self.description.keep(self._trajectory(run, params), **extras)
+        kept = self.description.keep(self._simulate_members(run, params), **extras)
         _require_dict(kept)
         return kept
 
-    def _trajectory(self, arrays: dict, params: PyTree) -> Trajectory:
+    def _simulate_members(self, arrays: dict, params: PyTree) -> Trajectory:
         scene, code, ts = self.description.system, arrays["code"], arrays.get("ts", self.description.ts)
         modes = dict(scene.modes) if isinstance(scene, Hybrid) else None
         return Trajectory.from_fields(
@@ -178,9 +178,9 @@ class Batches:
             contact_names=(),
         )  # fmt: skip
 
-    def _drift_of(self, arrays: tuple, params: PyTree):
+    def _energy_drift(self, arrays: tuple, params: PyTree):
         """|h − h₀| of a member from the first output to the end."""
-        scene, run = self.description.system, self._trajectory(arrays[0], params)
+        scene, run = self.description.system, self._simulate_members(arrays[0], params)
         if not self.conserves or isinstance(scene, Hybrid) or jumps(scene):
             return None
         q, qdot = jax.tree.map(lambda x: x[0], (run.q, run.qdot))
@@ -191,13 +191,13 @@ class Batches:
 
     def _keep_one_by_one(self, motions: "_BatchMotions") -> tuple[dict[str, np.ndarray], dict[int, str]]:
         """The result of `keep` for each member, one after the other; and the complaints about these results."""
-        rows, errors = self._rows(motions)
+        rows, errors = self._member_rows(motions)
         if not self.quantities and not any(rows):
             raise errors[0]  # at the first look, of all members
         complaints = {k: f"keep raised {_describe_error(error)}" for k, error in errors.items()}
         expected = self.quantities or _common_quantities([row for row in rows if row])
         for k, row in enumerate(rows):
-            if row is not None and (wrong := _misfit(expected, row)):
+            if row is not None and (wrong := _explain_misfit(expected, row)):
                 rows[k], complaints[k] = None, wrong
         kept = {q.name: np.full((len(rows), *q.shape), q.filling, q.dtype) for q in expected}
         for k, row in enumerate(rows):
@@ -205,7 +205,7 @@ class Batches:
                 kept[name][k] = x
         return kept, complaints
 
-    def _rows(self, motions: "_BatchMotions") -> tuple[list[dict[str, np.ndarray] | None], dict[int, Exception]]:
+    def _member_rows(self, motions: "_BatchMotions") -> tuple[list[dict[str, np.ndarray] | None], dict[int, Exception]]:
         of_all = jax.tree.map(np.asarray, (*motions.arrays, motions.params))
         keep_member = self._keep_member if "keep" in self.slow else self._keep_one
 
@@ -224,7 +224,7 @@ class _BatchMotions(NamedTuple):
     params: PyTree
 
 
-def _sound_times(ts: np.ndarray, complaints: dict[int, str]) -> tuple[np.ndarray, dict[int, str]]:
+def _replace_bad_times(ts: np.ndarray, complaints: dict[int, str]) -> tuple[np.ndarray, dict[int, str]]:
     """Times (B, T), in place of those that cannot be followed any others; and what is wrong with these, by members."""
     steps = np.diff(ts, axis=1)
     is_sound: Any = np.isfinite(ts).all(axis=1) & ((steps > 0).all(axis=1) | (steps < 0).all(axis=1))
@@ -274,7 +274,7 @@ def _common_quantities(rows: list[dict[str, np.ndarray]]) -> list[Quantity]:
 _KEPT = ("q", "qdot", "end", "mode", "transitions", "impacts", "contacts", "contact_changes")
 
 
-def _arrays(run: Trajectory) -> dict[str, Any]:
+def _result_arrays(run: Trajectory) -> dict[str, Any]:
     fields = {name: getattr(run, name) for name in _KEPT}
     fields |= {name: _fill_record(fields[name]) for name in ("impacts", "contact_changes") if fields[name] is not None}
     return fields | {"code": run.result._value, "stats": {k: x for k, x in run.stats.items() if jnp.ndim(x)}}
@@ -291,7 +291,7 @@ def _fill_record(record: Any) -> Any:
     return record._replace(**jax.tree.map(fill, parts))
 
 
-def _misfit(expected: list[Quantity], row: dict[str, np.ndarray]) -> str | None:
+def _explain_misfit(expected: list[Quantity], row: dict[str, np.ndarray]) -> str | None:
     names = [q.name for q in expected]
     if names != list(row):
         return f"keep returned {list(row)}, of other members {names}"

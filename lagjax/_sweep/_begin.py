@@ -23,7 +23,7 @@ UNIT_BYTES = 64 * 2**20  # of what is kept of a unit, by default
 _PROBED = 4096  # members by which the time of a member is estimated
 
 
-class _Look(NamedTuple):
+class _Preview(NamedTuple):
     """The kept values of a few members, the seconds that one of them takes, and whether the energy is constant."""
 
     kept: KeptResults
@@ -31,7 +31,7 @@ class _Look(NamedTuple):
     conserves: bool
 
 
-def _first_look(description: Description, points: dict[str, np.ndarray], compiled: list[Batches]) -> _Look:
+def _preview_members(description: Description, points: dict[str, np.ndarray], compiled: list[Batches]) -> _Preview:
     """A look at members at these points, or at as many as fit into the memory; what it compiles goes to `compiled`."""
     conserves = False  # resets may do work
     if not isinstance(description.system, Hybrid):
@@ -43,7 +43,7 @@ def _first_look(description: Description, points: dict[str, np.ndarray], compile
     began = time.perf_counter()
     kept = batches(points)
     compiled.append(batches)
-    return _Look(kept, (time.perf_counter() - began) / len(kept.result), conserves)
+    return _Preview(kept, (time.perf_counter() - began) / len(kept.result), conserves)
 
 
 def _thin_points(points: dict[str, np.ndarray], most: int) -> dict[str, np.ndarray]:
@@ -67,13 +67,13 @@ def begin(
         description = replace(description, starts=later.starts)
     scene, points = pack_description(description), _sample_points(axes, later)
     points = _thin_points(points, _members_in_memory(description, points))
-    kept, seconds, conserves = _first_look(description, points, compiled)
+    kept, seconds, conserves = _preview_members(description, points, compiled)
     quantities = [Quantity(name, x.shape[1:], x.dtype) for name, x in kept.values.items()]
     _require_names(quantities, axes, description.reduce)
     most = _batch.MOST_MEMBERS if kept.engine == "MachineCode" else _batch.MOST_ON_DEVICES
     spec = {
         "format": FORMAT, "versions": versions(), "cpu": cpu(), "engine": kept.engine, "shape": shape,
-        "chunk": Grid.from_shape(shape, _unit_size(unit, shape, seconds, quantities)).chunk,
+        "chunk": Grid.from_shape(shape, _choose_unit_size(unit, shape, seconds, quantities)).chunk,
         "batch": max(1, min(most, _members_in_memory(description, points))), "seconds_per_member": seconds,
         "kept": [{"name": q.name, "shape": q.shape, "dtype": q.dtype.str} for q in quantities], "conserves": conserves,
         "continues": later and later.store.identity(), "end": later and later.end, "path": users_path(),
@@ -106,7 +106,7 @@ def _sample_points(axes: tuple[Axis, ...], later: LaterEnd | None) -> dict[str, 
     return points if later is None else points | later.read(tuple(map(slice, shape)))[0]
 
 
-def _unit_size(unit: int | None, shape: tuple[int, ...], seconds: float, quantities: list[Quantity]) -> int:
+def _choose_unit_size(unit: int | None, shape: tuple[int, ...], seconds: float, quantities: list[Quantity]) -> int:
     """The members of a unit: the number given, or as many as take `SECONDS` and fit into `UNIT_BYTES`."""
     if unit is not None:
         if isinstance(unit, bool) or not isinstance(unit, int | np.integer) or unit < 1:

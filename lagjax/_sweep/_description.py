@@ -50,7 +50,7 @@ class Sections(NamedTuple):
     @classmethod
     def from_arguments(cls, crossings: Any, keep: Callable, settings: dict[str, Any]) -> "Sections | None":
         """The description given by the arguments of `sweep`. Raises `TypeError` or `ValueError` if wrong."""
-        takes_crossings = "crossings" in _parameters(keep)
+        takes_crossings = "crossings" in _parameter_names(keep)
         if crossings is None:
             if takes_crossings:
                 raise ValueError("keep asks for `crossings`: say which, by crossings={'section': a function}.")
@@ -79,7 +79,7 @@ class Sections(NamedTuple):
         return dict(zip(self.names or ("section",), self.functions, strict=True))
 
 
-def _parameters(keep: Callable) -> list[str]:
+def _parameter_names(keep: Callable) -> list[str]:
     try:
         return list(inspect.signature(keep).parameters)
     except (TypeError, ValueError):  # of what is written in C
@@ -162,7 +162,7 @@ def texts(description: Description, names: list[str]) -> dict[str, dict[str, str
     point = {name: jnp.zeros(()) for name in names}
     q, qdot, params = description.shapes(names)
     entries = {}
-    for name, function in _functions(description.system).items():
+    for name, function in _scene_functions(description.system).items():
         arguments = (q, qdot)[: len(ARGUMENTS.get(name.split()[0], (q, qdot)))]
         entries[name] = _entry(function.code.function, _defer_trace(function, arguments, params), function.arrays)
     if isinstance(scene := description.system, Hybrid):  # its modes and transitions without their functions
@@ -183,7 +183,7 @@ def texts(description: Description, names: list[str]) -> dict[str, dict[str, str
     return entries
 
 
-def _functions(scene: Scene) -> dict[str, Any]:
+def _scene_functions(scene: Scene) -> dict[str, Any]:
     """The functions of a scene by their roles; of a hybrid one by role and mode, or by role and transition."""
     if not isinstance(scene, Hybrid):
         named = {role: getattr(scene, role) for role in ROLES}
@@ -225,7 +225,7 @@ def _value_text(value: PyTree) -> str:
     return "\n".join(lines) or "None"
 
 
-def _difference(before: dict[str, dict[str, str]], now: dict[str, dict[str, str]]) -> str | None:
+def _text_difference(before: dict[str, dict[str, str]], now: dict[str, dict[str, str]]) -> str | None:
     """The differences between the texts in a store and those of a call, line by line; None where there are none."""
     parts = []
     for role in dict.fromkeys([*before, *now]):
@@ -252,7 +252,7 @@ def differences(spec: dict, here: dict, entries: Iterable[str], roles: Iterable[
     for name in entries:
         if name == "scene":
             before, now = ({x: of["scene"][x] for x in roles or of["scene"] if x in of["scene"]} for of in (spec, here))
-            lines += [change] if (change := _difference(before, now)) else []
+            lines += [change] if (change := _text_difference(before, now)) else []
         elif spec[name] != here[name]:
             before, now = (describe_axes(x[name]) if name == "axes" else x[name] for x in (spec, here))
             lines.append(f"{name}: {before} in the store, now {now}")

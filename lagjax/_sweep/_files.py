@@ -111,7 +111,7 @@ class Files:
                 f"{spec.get('versions', {}).get('lagjax')}; this lagjax writes format {FORMAT}. xarray can read it as "
                 "it is; to continue it, use that version."
             )
-        if _hash_of(_json(spec)) != written:
+        if _file_hash(_read_json(spec)) != written:
             raise ValueError(f"{file} cannot be read ({fault}): the store is damaged. {_ADVICE}")
         names = [name for x in (*spec["axes"], *spec["kept"]) for name in x.get("names", [x.get("name")])]
         if bad := [name for name in names if not is_file_name(name)]:  # a stranger's store stays in its folder
@@ -145,7 +145,7 @@ class Files:
 
     def identity(self) -> str:
         """The hash of the description and the functions: a store that was made anew is another one."""
-        return _hash_of((self.job / "spec.json").read_bytes() + self.scene())
+        return _file_hash((self.job / "spec.json").read_bytes() + self.scene())
 
     def scene(self) -> bytes:
         return (self.job / "scene.pkl").read_bytes()
@@ -212,7 +212,7 @@ class Files:
             warnings.simplefilter("ignore")  # that it is no part of the format yet; readers then list no folders
             zarr.consolidate_metadata(str(self.path))
         self.write(self.job / "scene.pkl", scene)
-        self.write(self.job / "spec.json", _json({"sha256": _hash_of(_json(spec)), **spec}))
+        self.write(self.job / "spec.json", _read_json({"sha256": _file_hash(_read_json(spec)), **spec}))
 
     def coordinates(self, axes: list[dict], box: tuple[slice, ...]) -> list[dict[str, np.ndarray]]:
         """The values along each axis of a box of members, by names. Raises `ValueError` where they are damaged."""
@@ -269,10 +269,10 @@ class Files:
         with self.explain_errors(f"unit {unit} was not written"):
             for q in self.quantities(spec):
                 data = _encode_chunk(grid, unit, q, values[q.name])
-                hashes[q.name] = _hash_of(data)
+                hashes[q.name] = _file_hash(data)
                 self.write(self.chunk_file(grid, unit, q), data)
             if statistics:
-                hashes[_STATISTICS] = _hash_of(statistics)
+                hashes[_STATISTICS] = _file_hash(statistics)
                 self.write(self.job / "done" / f"{unit}.npz", statistics)
             self.write(self.job / "done" / f"{unit}.json", json.dumps(record | {"sha256": hashes}).encode())
 
@@ -293,10 +293,10 @@ class Files:
         with ThreadPoolExecutor(_READERS) as readers:
             for k in range(0, len(units), _AHEAD):
                 these = units[k : k + _AHEAD]
-                damage |= dict(zip(these, readers.map(partial(self._damage_of, spec, whole), these), strict=True))
+                damage |= dict(zip(these, readers.map(partial(self._describe_damage, spec, whole), these), strict=True))
         return {unit: text for unit, text in damage.items() if text}
 
-    def _damage_of(self, spec: dict, whole: bool, unit: int) -> str | None:
+    def _describe_damage(self, spec: dict, whole: bool, unit: int) -> str | None:
         grid = self.grid(spec)
         if unit >= grid.units:
             return f"unit {unit}: there are but {grid.units} units"
@@ -315,7 +315,7 @@ class Files:
             if there is None or size not in (None, there):
                 have = "is not there" if there is None else f"has {there} bytes, where it should have {size}"
                 return f"unit {unit}: its {what} {have}"
-            if whole and _hash_of(file.read_bytes()) != hashes.get(name):
+            if whole and _file_hash(file.read_bytes()) != hashes.get(name):
                 return f"unit {unit}: its {what} is not what was written"
         return None
 
@@ -378,11 +378,11 @@ def _encode_chunk(grid: Grid, unit: int, q: Quantity, values: np.ndarray) -> byt
     return data + google_crc32c.value(data).to_bytes(_CHECKSUM, "little")
 
 
-def _json(spec: dict) -> bytes:
+def _read_json(spec: dict) -> bytes:
     return json.dumps(spec, indent=1, ensure_ascii=False).encode()
 
 
-def _hash_of(data: bytes) -> str:
+def _file_hash(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 

@@ -69,7 +69,7 @@ def axes_of(over: Any) -> tuple[Axis, ...]:
             "over must be a dict that is not empty: names with 1-D arrays or designs, as in {'l': np.linspace(1, 2, "
             f"50), ('a', 'b'): lagjax.designs.random(1000, seed=1)}}; got {type(over).__name__}."
         )
-    axes = tuple(_axis(key, value) for key, value in over.items())
+    axes = tuple(_member_axis(key, value) for key, value in over.items())
     names = [name for axis in axes for name in axis.names]
     taken = [*names, *(axis.dimension for axis in axes if len(axis.names) > 1), *RESERVED]
     for name in taken:
@@ -78,7 +78,7 @@ def axes_of(over: Any) -> tuple[Axis, ...]:
     return axes
 
 
-def _axis(key: Any, value: Any) -> Axis:
+def _member_axis(key: Any, value: Any) -> Axis:
     names = key if isinstance(key, tuple) else (key,)
     for name in names:
         if not isinstance(name, str) or not name.isidentifier():
@@ -88,14 +88,14 @@ def _axis(key: Any, value: Any) -> Axis:
     columns = value if isinstance(key, tuple) else (value,)
     if not isinstance(columns, tuple | list) or len(columns) != len(names):
         raise ValueError(f"over[{key!r}] must be a design, or a tuple of {len(names)} arrays of one length.")
-    arrays = tuple(_column(name, x) for name, x in zip(names, columns, strict=True))
+    arrays = tuple(_member_column(name, x) for name, x in zip(names, columns, strict=True))
     if len({x.size for x in arrays}) > 1:
         sizes = ", ".join(f"{name} {x.size}" for name, x in zip(names, arrays, strict=True))
         raise ValueError(f"What over[{key!r}] steps through together must have one length; got {sizes}.")
     return Axis(names, arrays[0].size, arrays)
 
 
-def _column(name: str, value: Any) -> np.ndarray:
+def _member_column(name: str, value: Any) -> np.ndarray:
     try:
         array = np.asarray(value)
     except ValueError:  # lists of several lengths

@@ -98,7 +98,7 @@ def status(store: Files) -> Status:
     failures = tuple(Failure(number, point(store, spec, number), name, why) for number, name, why in failed)
     drifts = [tuple(record["drift"]) for record in records if "drift" in record]
     worst = max(drifts, key=lambda pair: pair[0], default=None)
-    members, rate = sum(r["members"] for r in records), _rate(store, done, records)
+    members, rate = sum(r["members"] for r in records), _members_per_second(store, done, records)
     slow = {name: why for record in records for name, why in record["slow"].items()}
     return Status(
         store=str(store.path), done=members, members=grid.members, units_done=len(done), units=grid.units,
@@ -114,7 +114,7 @@ def point(store: Files, spec: dict, member: int) -> dict[str, float]:
     return {name: float(x[0]) for side in store.coordinates(spec["axes"], box) for name, x in side.items()}
 
 
-def _rate(store: Files, done: list[int], records: list[dict]) -> float | None:
+def _members_per_second(store: Files, done: list[int], records: list[dict]) -> float | None:
     """Members per second, from the times of the last files; the disk's clock is one for all workers."""
     if not records:
         return None

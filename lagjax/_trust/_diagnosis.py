@@ -136,10 +136,10 @@ def _find_cause(system: System, layout: Layout, params, ended: Ended) -> str:
         if np.isfinite(halves(ended.y)[0]).all() and derivation.kicks:
             return f"\n{_AT_CORNER}"
         return f"\n{_reset_to_nothing(layout, ended) if ended.by_resets else _OVERSTEPPED}"
-    text = _undefined(derivation, params, ended) or _singular_mass(derivation, ended)
-    if not text and (at := _running_away(derivation, ended)) is not None:
-        text = _escape(derivation, params, ended, at)
-    return f"\n{text}" if text else _run_check(system, derivation, params, ended) or _budget(ended)
+    text = _describe_undefined(derivation, params, ended) or _describe_singular_mass(derivation, ended)
+    if not text and (at := _describe_runaway(derivation, ended)) is not None:
+        text = _escape_place(derivation, params, ended, at)
+    return f"\n{text}" if text else _run_check(system, derivation, params, ended) or _budget_end(ended)
 
 
 def _describe_gaps(system: System, layout: Layout, params, ended: Ended) -> tuple[str, str]:
@@ -202,7 +202,7 @@ def _quantities_ahead(derivation: Derivation, numbers, ended: Ended) -> tuple[np
     """States, times and the scene's quantities there; without programs, forces and the gradient of L by JAX."""
     (_, v), motion, values = halves(ended.y), derivation.motion, {}
     try:
-        y, t = _states_ahead(ended, np.concatenate([v, _acceleration(derivation, ended)]))
+        y, t = _states_ahead(ended, np.concatenate([v, _end_acceleration(derivation, ended)]))
         names = {name: name if ended.scene is None else _OF_LARGE.get(name, name) for name, *_ in _QUANTITIES}
         of = ended.sample(derivation, y, t).quantities(*names.values())
         return y, t, {name: of[there] for name, there in names.items()}
@@ -216,7 +216,7 @@ def _quantities_ahead(derivation: Derivation, numbers, ended: Ended) -> tuple[np
     return y, t, values
 
 
-def _undefined(derivation: Derivation, params, ended: Ended) -> str:
+def _describe_undefined(derivation: Derivation, params, ended: Ended) -> str:
     """A sentence about the first of the scene's quantities that is not finite at the end or just ahead; or nothing."""
     numbers, along = eqx.filter(params, eqx.is_array_like), 1 + len(AHEAD)
     y, t, values = _quantities_ahead(derivation, numbers, ended)
@@ -230,12 +230,12 @@ def _undefined(derivation: Derivation, params, ended: Ended) -> str:
                 shown = join_names([f"{derivation.layout.names[i]} ({of[row, i]})" for i in bad])
                 by_time = row and not np.isfinite(of[row - 1 + along, bad]).any()
                 since = f", from t = {t[row]:.9g} on, whatever the state" if by_time else ""
-                offender = _offender(derivation, role, (*halves(y[row]), float(t[row]), numbers))
+                offender = _blame_operation(derivation, role, (*halves(y[row]), float(t[row]), numbers))
                 return f"Not finite {'just ahead' if row else 'there'}: {what} {shown}{since}{offender}."
     return ""
 
 
-def _offender(derivation: Derivation, role: str, arguments: tuple) -> str:
+def _blame_operation(derivation: Derivation, role: str, arguments: tuple) -> str:
     """The operation to blame of one of the scene's functions, and its line, as the end of a sentence."""
     motion = derivation.motion
     function, on = getattr(motion, role), motion.constraints.on_positions
@@ -256,14 +256,14 @@ def _short_functions(derivation: Derivation, params, ended: Ended) -> tuple[list
 
 
 def _is_short(function: Callable, arguments: tuple) -> bool:
-    return _equations(jax.make_jaxpr(function)(*arguments).jaxpr) <= LONGEST_FUNCTION
+    return _equations_at_end(jax.make_jaxpr(function)(*arguments).jaxpr) <= LONGEST_FUNCTION
 
 
-def _equations(jaxpr) -> int:
+def _equations_at_end(jaxpr) -> int:
     count = 0
     for equation in jaxpr.eqns:
         inner = [x for x in equation.params.values() if hasattr(x, "eqns") or hasattr(x, "jaxpr")]
-        count += 1 + sum(_equations(getattr(x, "jaxpr", x)) for x in inner)
+        count += 1 + sum(_equations_at_end(getattr(x, "jaxpr", x)) for x in inner)
     return count
 
 
@@ -271,7 +271,7 @@ def _equations(jaxpr) -> int:
 
 
 @np.errstate(all="ignore")
-def _singular_mass(derivation: Derivation, ended: Ended) -> str:
+def _describe_singular_mass(derivation: Derivation, ended: Ended) -> str:
     """A sentence where an eigenvalue of M has come down to next to nothing on the way."""
     if derivation.motion.constrained:  # which may hold what L does not
         return ""
@@ -320,12 +320,12 @@ def _describe_null(unused: list[str], directions, names: tuple[str, ...]) -> str
 
 
 @np.errstate(all="ignore")
-def _running_away(derivation: Derivation, ended: Ended) -> int | None:
+def _describe_runaway(derivation: Derivation, ended: Ended) -> int | None:
     """The coordinate that runs away, to a pole or to infinity; None where none does."""
     if _CODES[ended.code] not in ("dt_min_reached", "nonfinite_state"):
         return None
     try:
-        acceleration = np.abs(_acceleration(derivation, ended))
+        acceleration = np.abs(_end_acceleration(derivation, ended))
     except Unlowerable:
         return None
     _, velocity = halves(np.abs(ended.y))
@@ -337,7 +337,7 @@ def _running_away(derivation: Derivation, ended: Ended) -> int | None:
     return fastest if scale < part * abs(ended.t_last - ended.t_first) and velocity[fastest] > 0 else None
 
 
-def _escape(derivation: Derivation, params, ended: Ended, place: int) -> str:
+def _escape_place(derivation: Derivation, params, ended: Ended, place: int) -> str:
     """The place that a coordinate runs away to: a pole of an operation of the force or of L, or infinity."""
     functions, arguments = _short_functions(derivation, params, ended)
     pole = next((near for function in functions for near in poles(function, *arguments)), None)
@@ -387,14 +387,14 @@ def _run_check(system: System, derivation: Derivation, params, ended: Ended) -> 
     q, qdot = map(derivation.layout.restore, halves(ended.y))
     found = {finding.kind: finding for finding in reversed(list(check(system, q, qdot, ended.t, params)))}
     if (kind := next((kind for kind in _EXPLAIN if kind in found), None)) is not None:
-        return f"\nThere check says: {found[kind].message}{_budget(ended)}"
+        return f"\nThere check says: {found[kind].message}{_budget_end(ended)}"
     functions, arguments = _short_functions(derivation, params, ended)
     if system.touches:
         flat = Flat.from_system(system, derivation.layout, params)
         of_contacts = (lambda q, qdot, t, p: flat.gaps(q, t, p)), flat.one_way, flat.slips
         functions += [f for f in of_contacts if _is_short(f, arguments)]
     pieces = describe_pieces(functions, arguments) if jumps else ""
-    return f"\nThe scene is pieced together by {pieces}.{_budget(ended)}" if pieces else ""
+    return f"\nThe scene is pieced together by {pieces}.{_budget_end(ended)}" if pieces else ""
 
 
 def _count_unheld(derivation: Derivation) -> int:
@@ -405,7 +405,7 @@ def _count_unheld(derivation: Derivation) -> int:
         return 0
 
 
-def _budget(ended: Ended) -> str:
+def _budget_end(ended: Ended) -> str:
     """The time that was reached when the budget of steps was spent."""
     reached, whole = abs(ended.t - ended.t_first), abs(ended.t_last - ended.t_first)
     crossed = _CODES[ended.code] == "acceleration_discontinuous" and ended.steps > MANY_CROSSINGS
@@ -418,7 +418,7 @@ def _budget(ended: Ended) -> str:
     )
 
 
-def _acceleration(derivation: Derivation, ended: Ended) -> np.ndarray:
+def _end_acceleration(derivation: Derivation, ended: Ended) -> np.ndarray:
     """q̈ (n,) at the end."""
     return ended.sample(derivation, ended.y[None], ended.t).acceleration()[0]
 

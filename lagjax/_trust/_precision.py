@@ -73,7 +73,7 @@ class WorkPrecision(eqx.Module):
     _repr_pretty_ = show_str
 
     def __str__(self) -> str:
-        table = [_HEADER, *map(_cells, self.rows)]
+        table = [_HEADER, *map(_table_cells, self.rows)]
         widths = [max(map(len, column)) for column in zip(*table, strict=True)]
         lines = []
         for name, *numbers in table:
@@ -87,11 +87,11 @@ class WorkPrecision(eqx.Module):
 _HEADER = ("solver", "rtol", "error", "worst", "time", "per member", "accepted", "rejected", "ok", "wasted")
 
 
-def _cells(row: WorkPrecisionRow) -> tuple[str, ...]:
+def _table_cells(row: WorkPrecisionRow) -> tuple[str, ...]:
     """One row of the table that is printed, in the order of `_HEADER`."""
     return (
         row.solver, f"{row.rtol:.0e}", f"{row.error:.1e}", f"{row.worst_error:.1e}",
-        _duration(row.seconds), _duration(row.seconds_per_trajectory),
+        _run_duration(row.seconds), _run_duration(row.seconds_per_trajectory),
         f"{row.accepted_steps:.0f}", f"{row.rejected_steps:.0f}", f"{row.ok:.0%}", f"{row.wasted:.0%}",
     )  # fmt: skip
 
@@ -165,7 +165,7 @@ def work_precision(
     if solvers is None:  # the first is named after the integrator that `simulate` chooses
         name = "Taylor (machine code)" if run(None, max(tolerances)).engine == "MachineCode" else _FIRST
         measured = {f"default: {name}": None} | {other: of for other, of in _SOLVERS.items() if other != name}
-    truth, resolution = _reference(partial(run, None, reference=True), jnp.result_type(float))
+    truth, resolution = _reference_path(partial(run, None, reference=True), jnp.result_type(float))
     rows = []
     for name, solver in measured.items():
         run(solver, max(tolerances))  # compiles; tolerances are traced, so once per solver
@@ -173,11 +173,11 @@ def work_precision(
     return WorkPrecision(tuple(rows), *_median_and_worst(resolution), members=len(truth))
 
 
-def _reference(run: Callable[[float], Trajectory], dtype) -> tuple[np.ndarray, np.ndarray]:
+def _reference_path(run: Callable[[float], Trajectory], dtype) -> tuple[np.ndarray, np.ndarray]:
     """The path to compare with, shape (members, T, n), and for every member how far it can be trusted."""
     eps = float(jnp.finfo(dtype).eps)
-    truth = _path(run(_REFERENCE * eps))
-    resolution = np.abs(_path(run(_CHECK * eps)) - truth).max(axis=(1, 2))
+    truth = _coordinate_path(run(_REFERENCE * eps))
+    resolution = np.abs(_coordinate_path(run(_CHECK * eps)) - truth).max(axis=(1, 2))
     if np.isnan(resolution).all():
         raise ValueError(
             "The reference reached the end for none of the members: look at the result of simulate_batch with a tight "
@@ -198,12 +198,12 @@ def _row(name: str, rtol: float, run: Callable[[], Trajectory], truth: np.ndarra
     counts = "num_accepted_steps", "num_rejected_steps", "num_steps"
     accepted, rejected, steps = (np.atleast_1d(trajectory.stats[key]) for key in counts)
     idle = trajectory.stats.get("num_wasted_lane_steps", 0)  # of a batch only
-    errors = _median_and_worst(np.abs(_path(trajectory) - truth).max(axis=(1, 2)))
+    errors = _median_and_worst(np.abs(_coordinate_path(trajectory) - truth).max(axis=(1, 2)))
     shares = map(float, (accepted.mean(), rejected.mean(), np.mean(trajectory.ok), idle / max(steps.sum(), 1)))
     return WorkPrecisionRow(name, float(rtol), seconds, seconds / len(truth), *errors, *shares)
 
 
-def _path(trajectory: Trajectory) -> np.ndarray:
+def _coordinate_path(trajectory: Trajectory) -> np.ndarray:
     """All coordinates at all times, shape (members, T, n); NaN throughout for a member that did not reach its end."""
     return np.where(np.atleast_1d(trajectory.ok)[:, None, None], Members(trajectory).flat(trajectory.q), np.nan)
 
@@ -242,7 +242,7 @@ def _require_tolerances(tolerances: Sequence[float], dtype: np.dtype, solvers: M
             raise ValueError(f"Every tolerance must be a number of at least {least:.1e} in {dtype.name}; got {rtol}.")
 
 
-def _duration(seconds: float) -> str:
+def _run_duration(seconds: float) -> str:
     for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
         if seconds >= size:
             return f"{seconds / size:.3g} {unit}"

@@ -90,17 +90,17 @@ def _masses_lagrangian(q, qdot, params):
     return jnp.sum(0.5 * m * jnp.sum(qdot**2, axis=-1) - m * g * q[..., 1])
 
 
-def _rods(q, params):
+def _rod_lengths(q, params):
     rods = jnp.diff(q, axis=0, prepend=0.0)
     return (params["l"] ** 2 - jnp.sum(rods**2, axis=-1)) / (2 * params["l"])
 
 
-def _rod(q, params):
+def _rod_constraint(q, params):
     return {"rod": (params["l"] ** 2 - q @ q) / (2 * params["l"])}
 
 
-def _two_rods(q, params):
-    return dict(zip(("upper", "lower"), _rods(q, params), strict=True))
+def _two_rod_lengths(q, params):
+    return dict(zip(("upper", "lower"), _rod_lengths(q, params), strict=True))
 
 
 def cartesian_of_angles(theta, theta_dot, l):
@@ -129,7 +129,7 @@ def cartesian_pendulum() -> Scene:
 
     >>> scene = lagjax.scenes.cartesian_pendulum(); scene.exact(1.0, scene.q0, scene.qdot0, scene.params)
     """
-    system, params = System(_masses_lagrangian, constraints=_rod), {"m": 1.0, "l": 1.0, "g": 9.81}
+    system, params = System(_masses_lagrangian, constraints=_rod_constraint), {"m": 1.0, "l": 1.0, "g": 9.81}
     q0, qdot0 = np.array([-1.0, 0.0]), np.array([0.0, 0.0])
     return conservative_scene(system, params, q0, qdot0, duration=10.0, exact=_cartesian_pendulum_exact)
 
@@ -150,7 +150,7 @@ def cartesian_double_pendulum() -> Scene:
     >>> scene = cartesian_double_pendulum(); scene.system.multipliers(scene.q0, scene.qdot0, params=scene.params)
     """
     params = {"m": np.ones(2), "l": np.ones(2), "g": 9.81}
-    return _chain_at_rest(np.array([1.0, 1.5]), params, _two_rods)
+    return _chain_at_rest(np.array([1.0, 1.5]), params, _two_rod_lengths)
 
 
 def cartesian_chain(n=3) -> Scene:
@@ -162,7 +162,7 @@ def cartesian_chain(n=3) -> Scene:
 
     >>> scene = cartesian_chain(5); scene.system.multipliers(scene.q0, scene.qdot0, params=scene.params)
     """
-    return _chain_at_rest(np.full(n, 1.0), {"m": np.full(n, 1 / n), "l": np.full(n, 1 / n), "g": 9.81}, _rods)
+    return _chain_at_rest(np.full(n, 1.0), {"m": np.full(n, 1 / n), "l": np.full(n, 1 / n), "g": 9.81}, _rod_lengths)
 
 
 # ---- wires and surfaces ----------------------------------------------------------------------------------------------
@@ -173,7 +173,7 @@ def parabola(x, params):
     return 0.5 * params["k"] * x**2
 
 
-class _Wire(eqx.Module):
+class _OnWire(eqx.Module):
     shape: Callable = eqx.field(static=True)
 
     def __call__(self, q, params):
@@ -199,11 +199,11 @@ def bead_on_wire(shape=parabola, *, params=None, x0=1.0) -> Scene:
     >>> scene = bead_on_wire(lambda x, params: jnp.cosh(x), params={"m": 1.0, "g": 9.81})
     """
     params = {"m": 1.0, "g": 9.81, "k": 1.5} if params is None else params
-    system, q0 = System(_masses_lagrangian, constraints=_Wire(shape)), np.array([x0, float(shape(x0, params))])
+    system, q0 = System(_masses_lagrangian, constraints=_OnWire(shape)), np.array([x0, float(shape(x0, params))])
     return conservative_scene(system, params, q0, np.zeros(2), duration=5.0)
 
 
-def _sphere(q, params):
+def _sphere_constraint(q, params):
     return {"sphere": (q.x**2 + q.y**2 + q.z**2 - params["R"] ** 2) / (2 * params["R"])}
 
 
@@ -227,7 +227,7 @@ def particle_on_sphere() -> Scene:
     >>> scene = particle_on_sphere(); scene.system.multipliers(scene.q0, scene.qdot0, params=scene.params)
     """
     R, theta, phi = 1.0, 0.3, 0.7
-    system = System(_uniform_gravity_lagrangian, constraints=_sphere)
+    system = System(_uniform_gravity_lagrangian, constraints=_sphere_constraint)
     params = {"m": 1.0, "R": R, "g": 9.81}
     rho, rest = R * np.sin(theta), Cartesian(0.0, 0.0, 0.0)
     q0 = Cartesian(rho * np.cos(phi), rho * np.sin(phi), R * np.cos(theta))
@@ -255,7 +255,7 @@ class Blade(NamedTuple):
     phi: ArrayLike
 
 
-def _turning(t, speed, acceleration, phi, rate):
+def _turning_motion(t, speed, acceleration, phi, rate):
     """The way of a body, its components x and y, its speed and its heading φ after t, φ turning at `rate`.
 
     A force along the heading accelerates the body by `acceleration` cos φ.
@@ -281,7 +281,7 @@ def _rolling_without_slipping(q, qdot, params):
 def _rolling_disc_exact(t, q0, qdot0, params):
     m, R = params["m"], params["R"]
     acceleration = m * params["g"] * jnp.sin(params["slope"]) * R / (m * R**2 + params["I"])
-    rolled, x, y, spin, phi = _turning(t, qdot0.psi, acceleration, q0.phi, qdot0.phi)
+    rolled, x, y, spin, phi = _turning_motion(t, qdot0.psi, acceleration, q0.phi, qdot0.phi)
     q = Disc(q0.x + R * x, q0.y + R * y, phi, q0.psi + rolled)
     return q, Disc(R * spin * jnp.cos(phi), R * spin * jnp.sin(phi), qdot0.phi, spin)
 
@@ -318,7 +318,7 @@ def _knife_edge_lagrangian(q, qdot, params):
 def _knife_edge_exact(t, q0, qdot0, params):
     speed = qdot0.x * jnp.cos(q0.phi) + qdot0.y * jnp.sin(q0.phi)
     acceleration = params["g"] * jnp.sin(params["slope"])
-    _, x, y, speed, phi = _turning(t, speed, acceleration, q0.phi, qdot0.phi)
+    _, x, y, speed, phi = _turning_motion(t, speed, acceleration, q0.phi, qdot0.phi)
     return Blade(q0.x + x, q0.y + y, phi), Blade(speed * jnp.cos(phi), speed * jnp.sin(phi), qdot0.phi)
 
 

@@ -60,7 +60,7 @@ def uniform_gravity() -> Scene:
     return conservative_scene(system, params, q0, qdot0, duration=3.0, more=more, exact=_uniform_gravity_exact)
 
 
-class _OneDimension(eqx.Module):
+class _OneDimensionScene(eqx.Module):
     potential: Callable = eqx.field(static=True)
 
     def __call__(self, q, qdot, params):
@@ -80,7 +80,7 @@ def one_dimension(potential=double_well, *, q0=0.1, qdot0=0.0, params=None) -> S
     >>> scene = lagjax.scenes.one_dimension(lambda x, params: jnp.cosh(x), params={"m": 1.0})
     """
     params = {"m": 1.0, "a": 1.0, "b": 1.0} if params is None else params
-    return conservative_scene(System(_OneDimension(potential)), params, q0, qdot0, duration=20.0)
+    return conservative_scene(System(_OneDimensionScene(potential)), params, q0, qdot0, duration=20.0)
 
 
 def morse(x, params):
@@ -106,7 +106,7 @@ def morse_oscillator() -> Scene:
 
     >>> scene = lagjax.scenes.morse_oscillator(); scene.exact(1.0, scene.q0, scene.qdot0, scene.params)
     """
-    system, params = System(_OneDimension(morse)), {"m": 1.0, "D": 1.0, "a": 1.0}
+    system, params = System(_OneDimensionScene(morse)), {"m": 1.0, "D": 1.0, "a": 1.0}
     return conservative_scene(system, params, q0=1.2, qdot0=0.3, duration=20.0, exact=_morse_exact)
 
 

@@ -71,7 +71,7 @@ def test_files(run, tmp_path, monkeypatch):
     with image.open(tmp_path / "film.GIF") as gif:
         assert gif.n_frames == 5  # 0.1 s at 100/3 frames a second, and the last
         assert gif.info["duration"] == 30
-    monkeypatch.setattr(_animation, "_ffmpeg", lambda: None)
+    monkeypatch.setattr(_animation, "_find_ffmpeg", lambda: None)
     film.save(tmp_path / "film.html")
     text = (tmp_path / "film.html").read_text()
     assert text.startswith("<!doctype html>") and "data:image/png" in text
@@ -83,7 +83,7 @@ def test_files(run, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(_animation._ffmpeg() is None, reason="ffmpeg is not there")
+@pytest.mark.skipif(_animation._find_ffmpeg() is None, reason="ffmpeg is not there")
 def test_videos_and_space(run, tmp_path):
     film = run.animate(lambda q: jnp.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]) * q["x"], trace=1, speed=30.0)
     film.save(tmp_path / "film.mp4")

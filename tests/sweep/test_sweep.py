@@ -458,7 +458,7 @@ def test_a_damaged_description_is_a_sentence(tmp_path):
     del spec["sha256"]
     for name in ("../../x", "/x"):  # of a stranger, who knows how it is written
         own = spec | {"kept": [{"name": name, "shape": [], "dtype": "<f8"}]}
-        file.write_bytes(_files._json({"sha256": _files._hash_of(_files._json(own)), **own}))
+        file.write_bytes(_files._read_json({"sha256": _files._file_hash(_files._read_json(own)), **own}))
         with pytest.raises(ValueError, match=damaged):
             lagjax.Sweep(store)
 

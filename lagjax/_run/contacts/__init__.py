@@ -54,20 +54,20 @@ CHANGES = 1024  # the budget of changes of a motion whose crossings are asked fo
 
 def follow_contacts(given: Problem, problem: Problem, max_transitions: int | None) -> Trajectory:
     """The motion of a problem whose system has contacts; `problem` is `given` with what it closes over lifted."""
-    plan, *scenes = _plan(problem, max_transitions)
-    _require_sound(problem, *scenes)
+    plan, *scenes = _plan_contacts(problem, max_transitions)
+    _require_valid_contacts(problem, *scenes)
     if has_constraints(problem.system):
         q0, qdot0 = map(problem.layout.restore, halves(jnp.asarray(problem.y0)))
         require_consistent(problem.system, problem.layout, problem.ts, q0, qdot0, problem.params)
-    found = _put_on_device(_follow(plan, problem)) if problem.is_known else _follow_compiled(plan, problem)
+    found = _put_on_device(_follow_contacts(plan, problem)) if problem.is_known else _follow_compiled(plan, problem)
     return dataclasses.replace(found, ts=jnp.asarray(given.ts), system=given.system, params=given.params)
 
 
-def _follow(plan: ContactPlan, problem: Problem) -> Trajectory:
-    return _trajectory(problem, problem, *_motion(plan, problem), None, plan.max_transitions)
+def _follow_contacts(plan: ContactPlan, problem: Problem) -> Trajectory:
+    return _trajectory(problem, problem, *_contact_outcome(plan, problem), None, plan.max_transitions)
 
 
-_follow_compiled = compile_for_one_call(_follow)  # outside of `jit` one program, and not one an operation
+_follow_compiled = compile_for_one_call(_follow_contacts)  # outside of `jit` one program, and not one an operation
 
 
 def _put_on_device(trajectory: Trajectory) -> Trajectory:
@@ -78,7 +78,7 @@ def _put_on_device(trajectory: Trajectory) -> Trajectory:
 
 def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int | None, params, params_axes) -> Trajectory:
     """The motions of a batch whose system has contacts."""
-    plan, *_ = _plan(batch.whole, max_transitions)
+    plan, *_ = _plan_contacts(batch.whole, max_transitions)
     if batch.is_known:
         found = follow_rows(functools.partial(follow_known, plan), batch.member, batch.ts, batch.y0, batch.vectors)
     else:
@@ -88,7 +88,7 @@ def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int | Non
     return dataclasses.replace(_put_on_device(trajectory), params=params)
 
 
-def _motion(plan: ContactPlan, problem: Problem) -> tuple[ContactEnding, RoundRecord, tuple]:
+def _contact_outcome(plan: ContactPlan, problem: Problem) -> tuple[ContactEnding, RoundRecord, tuple]:
     if not problem.is_known:
         return follow_in_doubles(functools.partial(contact_motion, plan), problem)
     return follow_in_numbers(functools.partial(follow_known, plan), problem)
@@ -99,16 +99,16 @@ def note_sections(problem: Problem, functions: tuple, directions: tuple[int, ...
 
     Raises `ValueError` as `follow_contacts` does.
     """
-    plan, *scenes = _plan(problem, CHANGES + len(functions) * (room + 1))
-    _require_sound(problem, *scenes)
+    plan, *scenes = _plan_contacts(problem, CHANGES + len(functions) * (room + 1))
+    _require_valid_contacts(problem, *scenes)
     plan = dataclasses.replace(plan, sections=functions, directions=directions)
-    ending, record, _ = jax.tree.map(jnp.asarray, _motion(plan, problem))
+    ending, record, _ = jax.tree.map(jnp.asarray, _contact_outcome(plan, problem))
     count = Shapes.from_system(problem.system, problem.layout, problem.params).count
     which = jnp.maximum(record.contact - count, -1)
     return (which, record.t, record.y_next), ending.result, (ending.t, ending.y)
 
 
-def _plan(problem: Problem, max_transitions: int | None) -> tuple[ContactPlan, Problem, Problem]:
+def _plan_contacts(problem: Problem, max_transitions: int | None) -> tuple[ContactPlan, Problem, Problem]:
     """The plan, and the problems of machine code with all contacts closed, and without contacts, in float64.
 
     Raises `ValueError` where the scene has no machine code, or the motion goes back in time.
@@ -145,15 +145,15 @@ def _plan(problem: Problem, max_transitions: int | None) -> tuple[ContactPlan, P
     return plan, dataclasses.replace(closed, ts=wide.ts, y0=wide.y0), free
 
 
-def _require_sound(problem: Problem, closed: Problem, free: Problem) -> None:
+def _require_valid_contacts(problem: Problem, closed: Problem, free: Problem) -> None:
     """Raise `ValueError` for what can be known to be wrong of the gaps at the start and of the coefficients."""
     if problem.is_known:
         with jax.enable_x64(True):
-            _require_open(problem, closed, free)
+            _require_positive_gaps(problem, closed, free)
         require_coefficients(problem.system, problem.params)
 
 
-def _require_open(problem: Problem, closed: Problem, free: Problem) -> None:
+def _require_positive_gaps(problem: Problem, closed: Problem, free: Problem) -> None:
     """Raise `ValueError` where the motion starts with a negative gap, beyond the rounding of its numbers."""
     derivation, n = closed.derivation.lowered, problem.layout.size
     shapes = Shapes.from_system(problem.system, problem.layout, problem.params)

@@ -97,7 +97,7 @@ def contact_motion(
     ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
     numbers, scene = eqx.filter(params, eqx.is_array_like), scene_of(plan, layout, params, len(ts))
     given = ts, y0, vector_of(numbers).astype(float), scene.flat.restitution(numbers), scene.flat.friction(numbers)
-    return _arrange(scene, *scene.replay.follow(*given), given[:3])
+    return _arrange_outcome(scene, *scene.replay.follow(*given), given[:3])
 
 
 def follow_known(plan: ContactPlan, layout: Layout, params: PyTree, ts, y0, vectors) -> tuple:
@@ -116,7 +116,7 @@ def follow_known(plan: ContactPlan, layout: Layout, params: PyTree, ts, y0, vect
         coefficients = np.split(np.stack(values, axis=-1), [scene.flat.shapes.count], axis=1)
     code, given = scene.replay.code, (np.asarray(ts, float), np.asarray(y0, float), vectors)
     found = code.run(*given, *coefficients, room=None)
-    return _arrange(scene, found, *scene.replay.read(found), ())
+    return _arrange_outcome(scene, found, *scene.replay.read(found), ())
 
 
 def _coefficients_at(flat: Flat, params: PyTree, vector) -> list[np.ndarray]:
@@ -127,7 +127,7 @@ def _coefficients_at(flat: Flat, params: PyTree, vector) -> list[np.ndarray]:
     return [np.asarray(flat.restitution(given)), np.asarray(flat.friction(given))]
 
 
-def _arrange(scene: SearchedScene, found: Found, row, played: Played, inputs: tuple) -> tuple:
+def _arrange_outcome(scene: SearchedScene, found: Found, row, played: Played, inputs: tuple) -> tuple:
     """The ending, the changes, and the impacts in front; of what varies with `inputs`, if it is traced."""
     library: Any = jnp if inputs else np
 
@@ -180,15 +180,15 @@ def _make_scene(
     derivation: Derivation, open_derivation: Derivation, whole: Derivation, scene: ContactScene,
     tolerances: Tolerances, most: int, single: bool, sections: tuple, ways: tuple, code: tuple, structure, times: int
 ) -> SearchedScene:  # fmt: skip
-    flat = _flat_of(derivation, scene, structure, code)
+    flat = _flat_functions(derivation, scene, structure, code)
     places, shapes, n = RowPlaces.from_derivation(whole, flat), flat.shapes, derivation.layout.size
     corners = corners_of(whole, places.all, shapes)
     turns, r, d, k = 0 if corners is None else len(corners.touch), flat.rough.size, shapes.directions, shapes.count
     watched = turns, sections, ways, code, structure, single
     open_scene, watches = ContactScene(scene.system, is_open=True), k + r + 2 * turns + len(sections)
-    modes, more = [], lambda: {"MULTIPLIERS": line_of(_forces_of(derivation, scene, flat))}
+    modes, more = [], lambda: {"MULTIPLIERS": line_of(_all_multipliers(derivation, scene, flat))}
     for of, law, make_lines in ((open_derivation, open_scene, dict), (derivation, scene, more)):
-        find = functools.partial(_watches, of, law, *watched)
+        find = functools.partial(_contact_watches, of, law, *watched)
 
         def make(of=of, find=find):
             return make_flow(of, scene.path, find().guards(remembers=True))
@@ -200,7 +200,7 @@ def _make_scene(
     acceleration = line_of((open_derivation if corners is None else derivation).accelerations.program, n)
     lines = {"RESPONSE": line_of(response), "BENDS": line_of(bends).with_derivative, "ACCELERATION": acceleration}
     if scene.system.impacts == "poisson" and r:
-        lines["CONSTRUCT"] = line_of(lower(_construct, jax.ShapeDtypeStruct((8,), float)))
+        lines["CONSTRUCT"] = line_of(lower(_routh_construction, jax.ShapeDtypeStruct((8,), float)))
     if corners is not None:
         lines["SIDES"] = line_of(corners.sides)
         lines["SIDE_SLOPES"] = lines["SIDES"].forward
@@ -220,7 +220,7 @@ def _make_scene(
     return SearchedScene(ContactReplay(searched, flow), flat, _lower_coefficients(flat, derivation.numbers.params))
 
 
-def _construct(x):
+def _routh_construction(x):
     """Routh's construction of the coupling (2, 2) and rates (2,) of a contact, then e and μ."""
     return construct_impulses(x[:4].reshape(2, 2), x[4:6], x[6:7], x[7:])
 
@@ -232,7 +232,7 @@ def _lower_coefficients(flat: Flat, numbers: PyTree) -> Program | None:
         return None
 
 
-def _flat_of(derivation: Derivation, scene: ContactScene, structure, code: tuple) -> Flat:
+def _flat_functions(derivation: Derivation, scene: ContactScene, structure, code: tuple) -> Flat:
     """The functions of contacts for parameters of which `code` and `structure` are what is not a number."""
     zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), derivation.numbers)
     return Flat.from_system(scene.system, derivation.layout, eqx.combine(zeros, structure.unflatten(code)).params)
@@ -276,7 +276,7 @@ def slots_of(whole: Derivation, flat: Flat) -> tuple[int, int] | None:
     return slots if sum(slots) < held_size(shapes, n) else None
 
 
-def _forces_of(derivation: Derivation, scene: ContactScene, flat: Flat) -> Program:
+def _all_multipliers(derivation: Derivation, scene: ContactScene, flat: Flat) -> Program:
     """All multipliers; with slots those of the contacts, (k + r d,)."""
     if scene.slots is None:
         return derivation.accelerations.multipliers
@@ -311,14 +311,14 @@ class RowPlaces(NamedTuple):
 
 
 @functools.lru_cache(maxsize=64)
-def _watches(
+def _contact_watches(
     derivation, scene: ContactScene, turns: int, sections: tuple, ways: tuple, code: tuple, structure, single
 ) -> Surfaces:
     """The watches of all contacts as programs: the k normal ones, those of friction, r, of corners, and the sections.
 
     `code` and `structure` are what the parameters hold that is not a number.
     """
-    flat = _flat_of(derivation, scene, structure, code)
+    flat = _flat_functions(derivation, scene, structure, code)
     shapes, rough = flat.shapes, flat.rough
     corners = None
     if turns and not scene.is_open:

@@ -50,7 +50,7 @@ class ContactReplay(Replay):
         n, k = code.sizes["N"], code.sizes["K"]
         self._flow, self._lines = flow, code.lines
         self._find_watches = cast(Callable[[], Surfaces], code.modes[HELD].find_surfaces)
-        # The places at which the parts of what `_end` gives end, but the last.
+        # The places at which the parts of what `_end_effects` gives end, but the last.
         self._ends, self._rough = np.cumsum([1, 1, n, 1, k, 1, 2 * n, 1]), code.arrays["ROUGH"]
         self.said = int(self._ends[5]) - 1
         super().__init__(code, 5)
@@ -66,7 +66,7 @@ class ContactReplay(Replay):
         (t, y), decides, still = start, row.decides > 0, jax.lax.stop_gradient
         numbers = jnp.concatenate([vector, row.did])
         path, *stop = run_stretch(self._flow(), self._find_watches(), self.code.tolerances, times, y, numbers, *event)
-        ended = self._end((*stop, vector, t, y, halves(y0)[1], restitution, friction), record)
+        ended = self._end_effects((*stop, vector, t, y, halves(y0)[1], restitution, friction), record)
         is_behind = np.isin(np.arange(ended.size), np.arange(*self._ends[5:7]))
         smooth = (still(ended[0]) > 0) & (~is_behind | ~decides | (row.leaves_rest == 0))
         ended = differentiable_where(smooth, ended, *stop, vector)
@@ -79,12 +79,12 @@ class ContactReplay(Replay):
         path = jnp.where((ahead & (ts <= row.end))[:, None], path[1:-1], 0.0)
         return jnp.where((decides & (ts > row.end) & (ts <= last))[:, None], behind, path), said, behind, later
 
-    def _end(self, given: tuple, record):
+    def _end_effects(self, given: tuple, record):
         given = (record, *jax.lax.stop_gradient(given[:3]), *given)
-        return self._end_in_parts(*given) if self._line is None else self._line(join(*given))
+        return self._end_in_parts(*given) if self._watch_line is None else self._watch_line(join(*given))
 
     @functools.cached_property
-    def _line(self) -> Line | None:
+    def _watch_line(self) -> Line | None:
         n, k, r, numbers = (self.sizes[name] for name in ("N", "K", "R", "NUMBERS"))
         return self.line_of_end(self._end_in_parts, (), (2 * n,), (numbers,), (), (2 * n,), (n,), (k,), (r,))
 
@@ -102,7 +102,7 @@ class ContactReplay(Replay):
         ends = zip(moved, moving[:2], strict=True)
         t, y = (jnp.where(stays, start, jnp.where(crosses, *end)) for start, end in zip((t, y), ends, strict=True))
         rows, vector = self.rows_at(t, y, given[5]), given[5]
-        *impact, behind = self._jump((t, y), rows, row, vector, restitution, friction)
+        *impact, behind = self._impact_jump((t, y), rows, row, vector, restitution, friction)
         behind, later = jnp.where(decides, behind, y), t + jnp.where(decides, row.later_on, 0.0)
         shared = rows.values[:k], rows.gradients[k:] @ v0
         return join(jnp.where(smooth, 1.0, 0.0), t, halves(y)[1], *impact, behind, later, *shared)
@@ -116,7 +116,7 @@ class ContactReplay(Replay):
         ones = jnp.ones(r + r * d)
         return jnp.concatenate([y, t[None], vector, jnp.zeros(k), ones, jnp.zeros(doing - k - ones.size)])
 
-    def _jump(self, at, rows: ImpactRows, row, vector, restitution, friction):
+    def _impact_jump(self, at, rows: ImpactRows, row, vector, restitution, friction):
         """The time of an impact, impulses (k,), the energy lost, and the state (2n,) behind a change at (t, y)."""
         (t, y), k, hits = at, self.sizes["K"], row.hits > 0
         v = halves(y)[1]

@@ -118,7 +118,7 @@ class Hybrid:
         more = self.max_transitions + len(functions) * (room + 1)
         return Hybrid(self.modes, [*self.transitions, *notes], self.start, more)
 
-    def _now(self) -> "Hybrid":
+    def _current_edition(self) -> "Hybrid":
         """The scene with its functions as they are now: this one, where nothing that they read has changed."""
         modes = {name: present_system(mode) for name, mode in self.modes.items()}
         transitions = [transition.now() for transition in self.transitions]
@@ -143,7 +143,7 @@ def follow_modes(
 ) -> Trajectory:
     """The motion of a hybrid scene from (q0, qdot0); the arguments are those of `simulate`."""
     require_flag(throw, "throw")
-    layout, scene = Layout.from_state(q0, qdot0), scene._now()
+    layout, scene = Layout.from_state(q0, qdot0), scene._current_edition()
     modes, start = scene.modes, scene.first
     first = first_law(scene)
     problem = Problem.from_arguments(first, layout, q0, qdot0, ts, params, rtol, atol, max_steps)
@@ -176,13 +176,13 @@ def _raise_unless_ok(modes: dict[str, System], trajectory: Trajectory, layout: L
     name = trajectory.mode_names[int(last)]
     of_mode = dataclasses.replace(trajectory, system=modes[name])
     try:
-        return raise_unless_ok(of_mode, layout, lambda: _why_stopped(trajectory, layout))
+        return raise_unless_ok(of_mode, layout, lambda: _explain_stop(trajectory, layout))
     except SimulationError as error:
         text = f"{error}\nIt was in the mode {name!r}.{_last_transitions(trajectory)}"
         raise SimulationError(text, trajectory) from None
 
 
-def _why_stopped(trajectory: Trajectory, layout: Layout) -> str | None:
+def _explain_stop(trajectory: Trajectory, layout: Layout) -> str | None:
     """A sentence that says why its transitions ended it; None where the result says it."""
     changes, names, modes = trajectory.transitions, trajectory.mode_names, trajectory.system
     assert changes is not None and isinstance(modes, dict)
@@ -265,7 +265,7 @@ Scene = System | Hybrid
 
 def require_scene(scene: Any) -> Scene:
     """The scene with its functions as they are now. Raises `TypeError` for what is no `System` or `Hybrid`."""
-    return scene._now() if isinstance(scene, Hybrid) else require_system(scene, contacts=True)
+    return scene._current_edition() if isinstance(scene, Hybrid) else require_system(scene, contacts=True)
 
 
 def jumps(scene: Any) -> bool:

@@ -122,22 +122,24 @@ class ModeParts:
         self.make_guarded = functools.partial(make_flow, derivation, system.path, guards)
         self._resets = [transition if transition.reset else None for transition in leaving.values()]
         self.reset_lines = [of and self._lower_reset(of) for of in self._resets]
-        self.check = self._lower(functools.partial(self._is_off, system)) if has_constraints(system) else None
+        self.check = (
+            self._lower_function(functools.partial(self._is_disabled, system)) if has_constraints(system) else None
+        )
 
-    def _lower(self, function: Callable) -> Line:
+    def _lower_function(self, function: Callable) -> Line:
         y = jax.ShapeDtypeStruct((2 * self._derivation.layout.size + 1,), float)
         return line_of(lower(function, y, self._derivation.numbers, budget=forms.OPERATION_BUDGET))
 
     def _lower_reset(self, transition: Transition) -> Line:
         try:
-            return self._lower(functools.partial(self._reset, transition))
+            return self._lower_function(functools.partial(self._reset_value, transition))
         except Unlowerable as why:
             raise Unlowerable(f"of {transition!r}, {why}") from None
 
-    def _reset(self, transition: Transition, y, numbers):
+    def _reset_value(self, transition: Transition, y, numbers):
         return state_after(transition, self._derivation.layout, y[-1], y[:-1], self._restore(numbers))
 
-    def _is_off(self, system: System, y, numbers):
+    def _is_disabled(self, system: System, y, numbers):
         layout, state = self._derivation.layout, (*halves(y[:-1]), y[-1], numbers)
         terms = self._derivation.term_sizes(*state)
         off = is_inconsistent(system._motion(layout, self._restore(numbers)), state, jnp.inf, self._dtype, terms)
@@ -151,7 +153,7 @@ class ModeParts:
         def reset(transition: Transition, t, y, vector):
             parts = zip(jnp.split(vector, ends)[: len(leaves)], leaves, strict=True)
             numbers = structure.unflatten([part.reshape(leaf.shape).astype(leaf.dtype) for part, leaf in parts])
-            return self._reset(transition, jnp.append(y, t), numbers)
+            return self._reset_value(transition, jnp.append(y, t), numbers)
 
         return [of and functools.partial(reset, of) for of in self._resets]
 
@@ -175,14 +177,14 @@ def make_mode(name: str, transitions: tuple[Transition, ...], problem: Problem) 
 
 @functools.lru_cache(maxsize=64)
 def _make_parts(derivation: Derivation, system: System, leaving, code, structure, numbers, is_rounded) -> ModeParts:
-    surfaces = _surfaces(derivation, system, leaving, code, structure)
+    surfaces = _guard_surfaces(derivation, system, leaving, code, structure)
     surfaces = surfaces and surfaces._replace(is_rounded=is_rounded)
     others = structure.unflatten(code)
     of = dict(zip(numbers, leaving, strict=True))
     return ModeParts(derivation, system, of, surfaces, lambda numbers: eqx.combine(numbers, others), is_rounded)
 
 
-def _surfaces(derivation: Derivation, system: System, leaving: tuple, code: tuple, structure) -> Surfaces | None:
+def _guard_surfaces(derivation: Derivation, system: System, leaving: tuple, code: tuple, structure) -> Surfaces | None:
     """The guards of the transitions that leave a mode, lowered once; None where none leaves."""
     # `code` and `structure` are what params hold that is not a number. Raises `Unlowerable`.
     if not leaving:

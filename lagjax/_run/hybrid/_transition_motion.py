@@ -58,7 +58,7 @@ def hybrid_motion(plan: HybridPlan, layout: Layout, ts, y0, params: PyTree, star
     replay = replay_of(plan, layout, params, len(ts))
     vector = vector_of(eqx.filter(params, eqx.is_array_like)).astype(float)
     given = ts, y0, vector, jax.lax.stop_gradient(jnp.asarray(start, float))[None]
-    return _arrange(plan, layout, replay, *replay.follow(*given), given[:3])
+    return _arrange_outcome(plan, layout, replay, *replay.follow(*given), given[:3])
 
 
 def follow_known(plan: HybridPlan, layout: Layout, params: PyTree, ts, y0, vectors, start) -> Ending:
@@ -70,10 +70,10 @@ def follow_known(plan: HybridPlan, layout: Layout, params: PyTree, ts, y0, vecto
     replay, starts = replay_of(plan, layout, params, ts.shape[1]), np.full((len(y0), 1), float(start))
     given = (np.asarray(x, float) for x in (ts, y0, vectors))
     found = replay.code.run(*given, starts, room=plan.max_transitions + 1)
-    return _arrange(plan, layout, replay, found, *replay.read(found), ())
+    return _arrange_outcome(plan, layout, replay, found, *replay.read(found), ())
 
 
-def _arrange(
+def _arrange_outcome(
     plan: HybridPlan, layout: Layout, replay: HybridReplay, found: Found, row, played: PlayedModes, inputs: tuple
 ) -> Ending:
     """The outputs, transitions and result of a motion, from the parts played; in JAX if `inputs` are given."""

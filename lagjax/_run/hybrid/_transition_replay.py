@@ -56,7 +56,7 @@ class HybridReplay(Replay):
             of_mode = jnp.where(here, times, t), y, numbers, jnp.where(here, end, t), stop, k, crosses & here
             outputs, *at = run_stretch(parts.make_flow(), parts.surfaces, self.code.tolerances, *of_mode)
             parts_of_end = (*at, numbers, t, y)
-            found = self._end(place, (record, *jax.lax.stop_gradient(parts_of_end[:3]), *parts_of_end))
+            found = self._end_effects(place, (record, *jax.lax.stop_gradient(parts_of_end[:3]), *parts_of_end))
             found = differentiable_where(jax.lax.stop_gradient(found[0]) > 0, found[1:], *at, numbers)
             ended = found if ended is None else jnp.where(here, found, ended)
             path = jnp.where(here & (ahead & (ts <= row.end))[:, None], outputs[1:-1], path)
@@ -64,7 +64,7 @@ class HybridReplay(Replay):
         said, behind = jnp.split(ended, [self.said])
         return path, said, behind, ended[0]
 
-    def _end(self, place: int, given: tuple):
+    def _end_effects(self, place: int, given: tuple):
         line = self._line_of(place)
         return self._end_in_parts(place, *given) if line is None else line(join(*given))
 

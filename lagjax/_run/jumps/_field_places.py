@@ -66,14 +66,14 @@ class Places:
         assert all(self.fields[name] == of[name] for of in kinds for name in of), "two counts of one name"
         self.at = SimpleNamespace(**self.of)
         self.structs = {
-            "Scene": Struct({x.lower(): self.of[x] for x in (*numbers, *self.arrays)}, _lower(numbers), None),
-            "Member": self._struct(self.memory), "Room": self._struct(self.work),
-            "Entry": self._struct(self.record, "TO_"),
+            "Scene": Struct({x.lower(): self.of[x] for x in (*numbers, *self.arrays)}, _lower_case(numbers), None),
+            "Member": self._struct_layout(self.memory), "Room": self._struct_layout(self.work),
+            "Entry": self._struct_layout(self.record, "TO_"),
         }  # fmt: skip
 
-    def _struct(self, fields: dict[str, str], prefix: str = "") -> Struct:
+    def _struct_layout(self, fields: dict[str, str], prefix: str = "") -> Struct:
         places = {name.lower(): self.of[prefix + name] for name in fields}
-        return Struct(places, _lower(name for name in fields if not fields[name]), "scene")
+        return Struct(places, _lower_case(name for name in fields if not fields[name]), "scene")
 
     def count_doubles(self, sizes: dict[str, int]) -> dict[str, int]:
         """The count of doubles in each field of a memory, of the room of a thread and of a row."""
@@ -97,5 +97,5 @@ class Places:
         return scene
 
 
-def _lower(names) -> frozenset[str]:
+def _lower_case(names) -> frozenset[str]:
     return frozenset(name.lower() for name in names)

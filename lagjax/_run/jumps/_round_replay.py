@@ -50,7 +50,7 @@ class Replay:
         states = 2 * code.sizes["N"]
         shapes = ((self.said,), (states,)), ((code.sizes["TIMES"], states),)
         self.code, self.sizes = code, code.sizes
-        self._rounds = Repetition(self._play, varying, 2, *shapes)
+        self._rounds = Repetition(self._play_round, varying, 2, *shapes)
 
     def __call__(self, *given) -> tuple:
         """The parts of `played`, of what a search is given."""
@@ -96,7 +96,7 @@ class Replay:
     def _read(self, record):
         return self.code.read(record, self.code.law.places.record)
 
-    def _play(self, given, carry, _, rows):
+    def _play_round(self, given, carry, _, rows):
         ts, (t, y), (record,), still = given[0], carry, rows, jax.lax.stop_gradient
         row, begun = self._read(record), still(t)
         ahead = (ts > begun) | (ts == jnp.where((begun == ts[0]) & (row.end > begun), begun, jnp.nan))

@@ -98,9 +98,9 @@ class SceneCode:
         self.arrays, self.fields = {"COUNTS": counts, **empty, **arrays}, law.places.count_doubles(self.sizes)
         self._keep = []  # what the addresses point to
         self.flow_of = functools.cache(lambda mode: modes[mode].make())
-        self.scene = functools.cache(self._scene)
+        self.scene = functools.cache(self._scene_row)
 
-    def _scene(self, many: bool) -> np.ndarray:
+    def _scene_row(self, many: bool) -> np.ndarray:
         """The row of integers that the search takes, without what modes need; for one member, or for many."""
         places = self.law.places
         scene = places.write_scene(self.sizes, self.arrays, self.fields)
@@ -189,7 +189,7 @@ class SceneCode:
             memory[:, scene[at[name]] : scene[at[name]] + of.shape[1]] = of
         path = np.full((members, self.sizes["TIMES"], states), np.nan)
         did = np.full((members, self.sizes["TIMES"], self.sizes["DOING"]), -1.0)
-        run = _Run(self, scene, np.ascontiguousarray(ts), memory, path, did, room)
+        run = _BatchRun(self, scene, np.ascontiguousarray(ts), memory, path, did, room)
         run.follow()
         x = memory[:, scene[at["X"]] :]
         ending = [x[:, states : states + 1], x[:, :states]]
@@ -214,7 +214,7 @@ def _call_numpy(line: Line) -> tuple[Any, int]:
     return function, address
 
 
-class _Run:
+class _BatchRun:
     """A run of members, followed until all have ended."""
 
     def __init__(self, code: SceneCode, scene, ts, memory, path, did, room: int | None):
@@ -233,14 +233,14 @@ class _Run:
         while True:
             self.scene[self.at.ROOM] = self.record.shape[1]
             if len(places) == 1:
-                self._follow_some(places[0])
+                self._follow_members(places[0])
             else:
                 pool = ThreadPoolExecutor(cores())
                 try:
-                    list(pool.map(self._follow_some, places))
+                    list(pool.map(self._follow_members, places))
                 finally:  # who is interrupted waits for those that run, and for no others
                     pool.shutdown(cancel_futures=True)
-            self._answer(np.flatnonzero(self.results == ASKS).tolist())
+            self._answer_requests(np.flatnonzero(self.results == ASKS).tolist())
             if not (self.results == GOING).any():
                 break
             if (self.memory[self.results == GOING, self.scene[self.at.ROWS]] >= self.record.shape[1]).any():
@@ -251,7 +251,7 @@ class _Run:
             used = int(self.memory[:, self.scene[self.at.ROWS]].max(initial=1))
             self.record = np.ascontiguousarray(self.record[:, : max(used, 1)])
 
-    def _follow_some(self, members: slice) -> None:
+    def _follow_members(self, members: slice) -> None:
         scene, memory = self.scene.copy(), self.memory[members]
         outputs, states = scene[self.at.TIMES] + 2, 2 * scene[self.at.N]
         numbers = scene[self.at.INPUTS] - states - 1 + 2 * scene[self.at.WATCHES]
@@ -262,14 +262,14 @@ class _Run:
         arrays = ts, self.path[members], self.did[members], self.record[members], memory, work
         self._loops[0](scene.ctypes.data, len(memory), *(x.ctypes.data for x in arrays))
 
-    def _answer(self, asking: list[int]) -> None:
+    def _answer_requests(self, asking: list[int]) -> None:
         """Make the modes that members ask for, or follow stretches that the kernel did not finish."""
         code, at, many = self.code, self.at, len(self.memory) > 1
         known = self.scene.copy()
         for member in asking:
             mode = self._loops[3](known.ctypes.data, self.memory[member].ctypes.data)
             if known[known[at.PLANS] + 2 * mode]:
-                self._continue(member, mode)
+                self._continue_stretch(member, mode)
                 continue
             whole = code.scene(many)
             if whole[whole[at.PLANS] + 2 * mode] == 0:
@@ -278,7 +278,7 @@ class _Run:
             self.scene[at.STRIDE], self.scene[at.ROOM] = known[at.STRIDE], known[at.ROOM]
             self.results[member] = GOING
 
-    def _continue(self, member: int, mode: int) -> None:
+    def _continue_stretch(self, member: int, mode: int) -> None:
         """Follow a stretch that the kernel did not finish."""
         code, scene, memory, at, loops = self.code, self.scene, self.memory[member], self.at, self._loops
         states, ts = 2 * scene[at.N], self.ts[member if scene[at.STRIDE] else 0]

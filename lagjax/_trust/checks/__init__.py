@@ -73,7 +73,7 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
     require_number(t, "t")
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves((q, qdot, t, params))):
         raise ValueError("check needs numbers, not traced values: call it outside of jit, vmap and grad, on one state.")
-    reported = _inputs(layout, q, qdot, t, params)
+    reported = _check_inputs(layout, q, qdot, t, params)
     if any(finding.level == "error" for finding in reported):
         return Findings.sort(reported)
     found, omitted = _scene_findings(system, q, qdot, t, params)
@@ -86,35 +86,35 @@ def _scene_findings(system, q, qdot, t, params) -> tuple[list[Finding], str]:
     if layout.size > forms.LARGEST_DENSE and not derivation_of(system, layout, params).form.is_sparse:
         system = replace_functions(system, {role: getattr(system, role) for role in ROLES}, "array")
     scene = CheckedScene.from_state(system, layout, q, qdot, t, params)
-    reported = _derivative_checks.findings(scene) + _dissipation(scene) + _constraint_checks.findings(scene)
+    reported = _derivative_checks.findings(scene) + _check_dissipation(scene) + _constraint_checks.findings(scene)
     reported += _constraint_checks.contact_findings(scene) + _mass.findings(scene)
     if scene.is_large:
-        reported += [] if any(finding.level == "error" for finding in reported) else _acceleration(scene)
-        return [*reported, *_time(scene)], (
+        reported += [] if any(finding.level == "error" for finding in reported) else _check_acceleration(scene)
+        return [*reported, *_check_time(scene)], (
             f"Not looked at: time scales, jumps nearby, which constraints follow from others, and derivatives one by "
             f"one. That would take long for {layout.size} coordinates ({scene.derivation.form.structure})."
         )
     if not any(finding.level == "error" for finding in reported):
         known = {finding.where for finding in reported if finding.kind == "kink"}  # one finding for each direction
         nearby = [finding for finding in _jumps_near.findings(scene) if finding.where not in known]
-        reported += [*_acceleration(scene), *nearby, *_stiffness.findings(scene)]
-    return [*reported, *_time(scene)], ""
+        reported += [*_check_acceleration(scene), *nearby, *_stiffness.findings(scene)]
+    return [*reported, *_check_time(scene)], ""
 
 
 # ---- the arguments ---------------------------------------------------------------------------------------------------
 
 
-def _inputs(layout: Layout, q, qdot, t, params) -> list[Finding]:
+def _check_inputs(layout: Layout, q, qdot, t, params) -> list[Finding]:
     reported = []
     for name, tree in (("q", q), ("qdot", qdot), ("t", t), ("params", params)):
         for where, value in not_finite(tree, name):
             message = f"{where} is {value}: every number must be finite."
             reported.append(Finding("not_finite", "error", (where,), message))
-    reported += _precision(layout, q, qdot, params)
-    return reported + _small(layout, q)
+    reported += _check_precision(layout, q, qdot, params)
+    return reported + _check_small_coordinates(layout, q)
 
 
-def _small(layout: Layout, q) -> list[Finding]:
+def _check_small_coordinates(layout: Layout, q) -> list[Finding]:
     """Advice where an array of coordinates is so small beside another one that the default atol loses its digits."""
     rtol, eps = DEFAULT_RTOL, float(np.finfo(layout.dtype).eps)
     paths = jax.tree_util.tree_leaves_with_path(q)
@@ -134,7 +134,7 @@ def _small(layout: Layout, q) -> list[Finding]:
     return [Finding("small_state", "advice", small, message)]
 
 
-def _precision(layout: Layout, q, qdot, params) -> list[Finding]:
+def _check_precision(layout: Layout, q, qdot, params) -> list[Finding]:
     reported = []
     if layout.dtype == np.float32:
         wide = any(getattr(leaf, "dtype", None) == np.float64 for leaf in jax.tree.leaves((q, qdot, params)))
@@ -163,7 +163,7 @@ def _precision(layout: Layout, q, qdot, params) -> list[Finding]:
 # ---- what the forces do ----------------------------------------------------------------------------------------------
 
 
-def _dissipation(scene: CheckedScene) -> list[Finding]:
+def _check_dissipation(scene: CheckedScene) -> list[Finding]:
     """A warning where the dissipation function puts energy into the motion at some velocity."""
     power, size = scene.measured.power.T
     usable = np.isfinite(power)
@@ -179,7 +179,7 @@ def _dissipation(scene: CheckedScene) -> list[Finding]:
     return [Finding("creates_energy", "warning", (), message)]
 
 
-def _acceleration(scene: CheckedScene) -> list[Finding]:
+def _check_acceleration(scene: CheckedScene) -> list[Finding]:
     bad = ~np.isfinite(scene.solve_saddle()[0])
     if not bad.any():
         return []
@@ -191,7 +191,7 @@ def _acceleration(scene: CheckedScene) -> list[Finding]:
     return [Finding("acceleration_not_finite", "error", where, message)]
 
 
-def _time(scene: CheckedScene) -> list[Finding]:
+def _check_time(scene: CheckedScene) -> list[Finding]:
     functions = {role: getattr(scene.system, role) for role in ROLES}
     timed = tuple(role for role, f in functions.items() if f is not None and "t" in f.extras)
     if not timed:

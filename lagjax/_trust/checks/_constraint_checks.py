@@ -20,11 +20,11 @@ def findings(scene: CheckedScene) -> list[Finding]:
     names = scene.system.constraint_names(scene.layout, scene.arguments[3])
     bad = [k for k in range(len(names)) if not (np.isfinite(residual[k]) and np.isfinite(jacobian[0, k]).all())]
     if bad:
-        return [_not_finite(names[k], residual[k]) for k in bad]
+        return [_check_finite(names[k], residual[k]) for k in bad]
     positions = scene.derivation.position_count
     idle = [k for k in range(len(names)) if not jacobian[0, k].any()]
-    reported = [_idle(names[k], k >= positions, residual[k], jacobian[:, k]) for k in idle]
-    reported += _not_affine(names, jacobian, positions, scene.layout)
+    reported = [_check_idle(names[k], k >= positions, residual[k], jacobian[:, k]) for k in idle]
+    reported += _check_affine(names, jacobian, positions, scene.layout)
     if idle:
         return reported
     q, qdot, t, params = scene.arguments
@@ -38,16 +38,16 @@ def findings(scene: CheckedScene) -> list[Finding]:
     augmented = scene.augmented[0]
     if not np.isfinite(augmented).all() or len(null_velocities(augmented)):
         return reported
-    return [*reported, *_dependent(jacobian[0] @ np.linalg.solve(augmented, jacobian[0].T), names)]
+    return [*reported, *_check_independent(jacobian[0] @ np.linalg.solve(augmented, jacobian[0].T), names)]
 
 
-def _not_finite(name: str, value) -> Finding:
+def _check_finite(name: str, value) -> Finding:
     what = f"is {value}" if not np.isfinite(value) else "has a gradient that is not finite"
     message = f"{name} {what} at this state: look for a root or a norm at zero; constrain the square instead."
     return Finding("constraint_not_finite", "error", (name,), message)
 
 
-def _idle(name: str, of_velocities: bool, value, rows: np.ndarray) -> Finding:
+def _check_idle(name: str, of_velocities: bool, value, rows: np.ndarray) -> Finding:
     """A constraint whose gradient is zero: of no use here, and often an inequality or a square."""
     if of_velocities:
         message = (
@@ -69,7 +69,7 @@ def _idle(name: str, of_velocities: bool, value, rows: np.ndarray) -> Finding:
     return Finding("constraint_zero_gradient", "error", (name,), message)
 
 
-def _not_affine(names, jacobian, positions: int, layout: Layout) -> list[Finding]:
+def _check_affine(names, jacobian, positions: int, layout: Layout) -> list[Finding]:
     """Warnings where ∂a/∂q̇ changes with q̇; the last half of the states differs from the state itself in q̇ alone."""
     reported = []
     for k in range(positions, len(names)):
@@ -85,7 +85,7 @@ def _not_affine(names, jacobian, positions: int, layout: Layout) -> list[Finding
     return reported
 
 
-def _dependent(schur: np.ndarray, names: list[str]) -> list[Finding]:
+def _check_independent(schur: np.ndarray, names: list[str]) -> list[Finding]:
     """Advice for each constraint that is a combination of others, from the Schur complement (m, m)."""
     reported = []
     for row, factors in dependent_rows(schur).items():

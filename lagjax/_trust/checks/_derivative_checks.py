@@ -16,7 +16,7 @@ _ALL_AT_ONCE = 100
 
 
 def findings(scene: CheckedScene) -> list[Finding]:
-    if reported := _values(scene) or _not_finite(scene):
+    if reported := _check_values(scene) or _check_finite_derivatives(scene):
         return reported
     if scene.is_large or scene.layout.size > _ALL_AT_ONCE:
         return _compare_along_lines(scene)
@@ -27,7 +27,7 @@ def findings(scene: CheckedScene) -> list[Finding]:
 # ---- finite ----------------------------------------------------------------------------------------------------------
 
 
-def _values(scene: CheckedScene) -> list[Finding]:
+def _check_values(scene: CheckedScene) -> list[Finding]:
     m, reported = scene.measured, []
     for role, name, value in (("lagrangian", "L", scene.lagrangian), ("forces", "The force", m.extra),
                               ("dissipation", "D", scene.dissipation)):  # fmt: skip
@@ -35,11 +35,11 @@ def _values(scene: CheckedScene) -> list[Finding]:
             where = () if value.ndim == 0 else _select_names(scene.layout.names, ~np.isfinite(value))
             first, of = value[~np.isfinite(value)].ravel()[0], f" of {join_names(where)}" if where else ""
             message = f"{name}{of} is {first} at this state"
-            reported.append(Finding("value_not_finite", "error", where, message + _blame(scene, role, "value")))
+            reported.append(Finding("value_not_finite", "error", where, message + _blame_phrase(scene, role, "value")))
     return reported
 
 
-def _not_finite(scene: CheckedScene) -> list[Finding]:
+def _check_finite_derivatives(scene: CheckedScene) -> list[Finding]:
     m, n, names = scene.measured, scene.layout.size, scene.names
     first = ~np.isfinite(np.concatenate([m.by_q, m.momentum[0]]))
     drag = ~np.isfinite(m.by_v_of_dissipation)
@@ -59,7 +59,7 @@ def _not_finite(scene: CheckedScene) -> list[Finding]:
 
 def _no_derivative(scene: CheckedScene, role: str, what: str, where: tuple[str, ...], order: str) -> Finding:
     message = f"{what} {join_names(where)} is not finite at this state, although the function is"
-    return Finding("derivative_not_finite", "error", where, message + _blame(scene, role, order))
+    return Finding("derivative_not_finite", "error", where, message + _blame_phrase(scene, role, order))
 
 
 def _select_names(names, chosen) -> tuple[str, ...]:
@@ -82,7 +82,7 @@ _BRANCH = (
 )
 
 
-def _blame(scene: CheckedScene, role: str, order: str) -> str:
+def _blame_phrase(scene: CheckedScene, role: str, order: str) -> str:
     """The end of a sentence: which operation, with which operands, in which line, and what to write instead."""
     wanted = {"value": ("value",), "first": ("value", "first derivative")}.get(order)
     offending = [o for o in offenders(getattr(scene.motion, role), *scene.state) if not wanted or o.fault in wanted]
@@ -129,7 +129,7 @@ def _blocks(scene: CheckedScene, round_off):
 def _compare_derivatives(scene: CheckedScene, sides, name, role, derivative, directions, outputs) -> list[Finding]:
     m, dtype, names = scene.measured, scene.layout.dtype, scene.names
     chosen = np.ix_(directions, range(sides.plus.shape[1]), outputs)
-    place = _places(scene)[list(directions)]
+    place = _input_magnitudes(scene)[list(directions)]
     both, ahead, behind = slopes(
         sides.minus[chosen], m.here[list(outputs)], sides.plus[chosen], scene.steps[:, list(directions)], place,
         float(np.finfo(dtype).eps), sides.noise[list(outputs)],
@@ -140,13 +140,13 @@ def _compare_derivatives(scene: CheckedScene, sides, name, role, derivative, dir
     for i, k in list(zip(*np.nonzero(kinks), strict=True))[:_SHOWN]:
         of_velocity = name == "L" and directions[i] >= n
         values = behind.value[i, k], ahead.value[i, k], derivative[i, k]
-        reported.append(_kink(scene, name, role, names[i], values, of_velocity))
+        reported.append(_kink_finding(scene, name, role, names[i], values, of_velocity))
     for i, k in list(zip(*np.nonzero(wrong), strict=True))[:_SHOWN]:
-        reported.append(_wrong(name, names[i], derivative[i, k], both.value[i, k], both.error[i, k]))
+        reported.append(_wrong_derivative_finding(name, names[i], derivative[i, k], both.value[i, k], both.error[i, k]))
     return reported
 
 
-def _kink(scene: CheckedScene, name: str, role: str, along: str, values, of_velocity: bool) -> Finding:
+def _kink_finding(scene: CheckedScene, name: str, role: str, along: str, values, of_velocity: bool) -> Finding:
     """The finding for slopes below and above the state that differ; `values` are these and the derivative."""
     below, above, derivative = values
     slope = f"The slope of {name} along {along} is {below:.6g} below this state and {above:.6g} above it"
@@ -168,7 +168,7 @@ def _kink(scene: CheckedScene, name: str, role: str, along: str, values, of_velo
     return Finding("kink", "advice" if of_force else "error", (along,), slope + rest)
 
 
-def _wrong(name: str, along: str, derivative, slope, error) -> Finding:
+def _wrong_derivative_finding(name: str, along: str, derivative, slope, error) -> Finding:
     message = (
         f"The derivative of {name} along {along} is {derivative:.6g} by automatic differentiation, and "
         f"{slope:.6g} ± {error:.0e} by finite differences: a custom derivative is wrong, or "
@@ -201,7 +201,7 @@ def _compare_along_lines(scene: CheckedScene) -> list[Finding]:
             off = np.flatnonzero(_off_line(scene, direction)[0].any(axis=0)).tolist()
             blamed = [(k, i) for k in off if (i := _blamed_coordinate(scene, direction, k)) is not None]
             for k, i in blamed:
-                found = _describe_coordinate(scene, _only(direction, i), i, k)
+                found = _describe_coordinate(scene, _restrict(direction, i), i, k)
                 reported.setdefault((found.kind, _OF_LINES[k]), found)
             direction[[i for _, i in blamed]] = 0.0
             if not blamed:
@@ -214,7 +214,7 @@ def _blamed_coordinate(scene: CheckedScene, direction: np.ndarray, k: int) -> in
     part = np.flatnonzero(direction)
     while len(part) > 1:
         halves = part[: len(part) // 2], part[len(part) // 2 :]
-        part = next((of for of in halves if _off_line(scene, _only(direction, of))[0][:, k].any()), part[:0])
+        part = next((of for of in halves if _off_line(scene, _restrict(direction, of))[0][:, k].any()), part[:0])
     return int(part[0]) if len(part) else None
 
 
@@ -224,11 +224,11 @@ def _describe_coordinate(scene: CheckedScene, direction: np.ndarray, i: int, k: 
     sides = (behind, ahead) if size > 0 else (ahead, behind)
     values = (*(of.value[0, k] / size for of in sides), derivative[k] / size)
     if kinks[k]:
-        return _kink(scene, name, role, along, values, name == "L" and i >= scene.layout.size)
-    return _wrong(name, along, values[-1], both.value[0, k] / size, both.error[0, k] / abs(size))
+        return _kink_finding(scene, name, role, along, values, name == "L" and i >= scene.layout.size)
+    return _wrong_derivative_finding(name, along, values[-1], both.value[0, k] / size, both.error[0, k] / abs(size))
 
 
-def _only(direction: np.ndarray, part) -> np.ndarray:
+def _restrict(direction: np.ndarray, part) -> np.ndarray:
     return np.where(np.isin(np.arange(direction.size), part), direction, 0.0)
 
 
@@ -237,7 +237,7 @@ def _off_line(scene: CheckedScene, direction: np.ndarray) -> tuple[np.ndarray, S
     n, dtype = scene.layout.size, scene.layout.dtype
     steps = ladder(np.array([scene.sizes[-1] if direction[-1] else 1.0]), dtype)
     line, eps = scene.line(direction, steps[:, 0]), float(np.finfo(dtype).eps)
-    place = np.abs(direction) @ (_places(scene) / scene.sizes**2)
+    place = np.abs(direction) @ (_input_magnitudes(scene) / scene.sizes**2)
     sides = slopes(line.minus[None], line.here, line.plus[None], steps, np.array([place]), eps, 4 * eps * line.terms)
     both, ahead, behind = sides
     kinks = differ(ahead, behind, dtype)[0]
@@ -247,7 +247,7 @@ def _off_line(scene: CheckedScene, direction: np.ndarray) -> tuple[np.ndarray, S
     return np.stack([kinks, wrong]), both, ahead, behind, line.derivative
 
 
-def _places(scene: CheckedScene) -> np.ndarray:
+def _input_magnitudes(scene: CheckedScene) -> np.ndarray:
     """|q|, |q̇| and the time, (2n + 1,): the numbers of the state whose rounding moves what is computed from them."""
     q, v, t = (np.abs(np.asarray(x, float)) for x in scene.state[:3])
     speed = v.max()

@@ -54,12 +54,12 @@ def slopes(minus, here, plus, steps, place, eps: float, noise=0.0) -> tuple[Slop
             # f has the rounding of its value, and of every coordinate in it.
             terms = np.abs(place)[:, None, None] * np.abs(x)
             rounding = eps * (size + np.sum(np.where(np.isfinite(terms), terms, 0), axis=0)) + noise
-            return _best(x, (rounding + least) / h)
+            return _best_estimate(x, (rounding + least) / h)
 
         return best(both), best(ahead), best(behind)
 
 
-def _best(estimates: np.ndarray, rounding: np.ndarray) -> Slopes:
+def _best_estimate(estimates: np.ndarray, rounding: np.ndarray) -> Slopes:
     """The estimate of the rung with the least error, from (directions, rungs, outputs)."""
     changes = np.abs(np.diff(estimates, axis=1))
     # The largest of the changes to two rungs on either side.

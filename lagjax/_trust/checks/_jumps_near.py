@@ -54,11 +54,11 @@ def findings(scene: CheckedScene) -> list[Finding]:
     labels = [f"{name}{place}" for name, place, size in pieces for _ in range(size)]
     jumps = [
         _first_jump(scene, sides, scene.point, sign * vector, (name, size), labels)
-        for name, size, vector in _directions(scene)
+        for name, size, vector in _search_directions(scene)
         for sign in (1, -1)
     ]
     nearest = min((jump for jump in jumps if jump is not None), default=None)
-    return [] if nearest is None else [_finding(nearest, scene)]
+    return [] if nearest is None else [_jump_finding(nearest, scene)]
 
 
 def _sides_of_states(scene: CheckedScene) -> Callable:
@@ -78,7 +78,7 @@ def _sides_of_states(scene: CheckedScene) -> Callable:
     return jax.jit(jax.vmap(lambda point: sides_at(point[:n], point[n:-1], point[-1], params)))
 
 
-def _directions(scene: CheckedScene) -> list[tuple[str, float, np.ndarray]]:
+def _search_directions(scene: CheckedScene) -> list[tuple[str, float, np.ndarray]]:
     """(name, size, vector (2n + 1,)) of every direction: a coordinate or a velocity by its size, or the motion."""
     m, n = scene.measured, scene.layout.size
     axes = np.diag(scene.sizes)
@@ -122,7 +122,7 @@ def _first_jump(scene: CheckedScene, sides: Callable, start, vector, axis, label
     return None
 
 
-def _finding(jump: Discontinuity, scene: CheckedScene) -> Finding:
+def _jump_finding(jump: Discontinuity, scene: CheckedScene) -> Finding:
     here, derivation = jump.sizes == 0, scene.derivation
     where = "at this state" if here else f"{jump.distance:.3g} away along {jump.direction}"
     of_l, refusal = jump.what in ("L", "the momentum"), derivation.kick_refusal

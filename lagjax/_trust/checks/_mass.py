@@ -32,20 +32,24 @@ def findings(scene: CheckedScene) -> list[Finding]:
     if not np.isfinite(augmented[0]).all():
         return []  # a derivative is not finite, which was said already
     if len(null_velocities(augmented[0])):
-        return _singular(scene, augmented, usable)
+        return _check_singular(scene, augmented, usable)
     others = [augmented[k] for k in usable]
-    condition = _condition(augmented[0], names, DEFAULT_RTOL)
-    return [*_nearly_singular(augmented[0], others, names), *_signs(m.mass[0], m.jacobian[0], names), *condition]
+    condition = _check_condition(augmented[0], names, DEFAULT_RTOL)
+    return [
+        *_check_nearly_singular(augmented[0], others, names),
+        *_check_signs(m.mass[0], m.jacobian[0], names),
+        *condition,
+    ]
 
 
 def null_velocities(matrix: np.ndarray) -> np.ndarray:
     """Unit vectors (k, n), one a row, along which a symmetric matrix is zero up to the rounding of its entries."""
     # The entries are derivatives with some units of round-off each: more is allowed for here than in `_linear`, where a
     # matrix is solved with that is taken to be exact.
-    return null_directions(matrix, _rounding(matrix))
+    return null_directions(matrix, _rounding_fraction(matrix))
 
 
-def _rounding(matrix: np.ndarray) -> float:
+def _rounding_fraction(matrix: np.ndarray) -> float:
     """The part of the largest eigenvalue that rounding may make of a zero: 32 units for each row."""
     return 32 * singular_threshold(len(matrix), matrix.dtype)
 
@@ -58,12 +62,12 @@ _NO_ENERGY = (
 # ---- singular --------------------------------------------------------------------------------------------------------
 
 
-def _singular(scene: CheckedScene, augmented: np.ndarray, usable: list[int]) -> list[Finding]:
+def _check_singular(scene: CheckedScene, augmented: np.ndarray, usable: list[int]) -> list[Finding]:
     """Findings for K (states, n, n) that is singular at the state; `usable` are the states nearby where K is finite."""
     names, constrained = scene.layout.names, scene.motion.constrained
     empty = [i for i in range(len(names)) if all(not augmented[k][i].any() for k in [0, *usable])]
     momenta = scene.measured.momentum[[0, *usable]]
-    empty_rows = [_empty((names[i],), bool(momenta[:, i].any()), constrained) for i in empty]
+    empty_rows = [_massless_finding((names[i],), bool(momenta[:, i].any()), constrained) for i in empty]
     rest = [i for i in range(len(names)) if i not in empty]
 
     def among_rest(k):
@@ -74,11 +78,11 @@ def _singular(scene: CheckedScene, augmented: np.ndarray, usable: list[int]) -> 
     where = tuple(names[rest[i]] for i in np.flatnonzero(np.abs(here).max(axis=0) > 1e-6))
     combinations = "; ".join(describe_direction(u, [names[i] for i in rest]) for u in here)
     what = "The saddle point of M and the constraints" if constrained else "The mass matrix d2L/dqdot2"
-    kind, why = _classify(scene, here, {k: among_rest(k) for k in usable})
+    kind, why = _classify_singularity(scene, here, {k: among_rest(k) for k in usable})
     return [*empty_rows, Finding(kind, "error", where, f"{what} is singular along {combinations}, {why}")]
 
 
-def _empty(where: tuple[str, ...], linear: bool, constrained: bool) -> Finding:
+def _massless_finding(where: tuple[str, ...], linear: bool, constrained: bool) -> Finding:
     """The finding for coordinates of which M has zero rows, and whether L is linear in their velocities."""
     kind, name = "linear_in_velocity" if linear else "velocity_unused", join_names(where)
     velocity = join_names([f"d{name}" for name in where])
@@ -92,7 +96,7 @@ def _empty(where: tuple[str, ...], linear: bool, constrained: bool) -> Finding:
     return Finding(kind, "error", where, message)
 
 
-def _classify(scene: CheckedScene, here: np.ndarray, nearby: dict[int, np.ndarray]) -> tuple[str, str]:
+def _classify_singularity(scene: CheckedScene, here: np.ndarray, nearby: dict[int, np.ndarray]) -> tuple[str, str]:
     """The kind of a singularity with these null directions, and the rest of the sentence about it."""
     m = scene.measured
     if any(not len(directions) for k, directions in nearby.items() if not (m.velocity[k] != m.velocity[0]).any()):
@@ -111,12 +115,12 @@ def _classify(scene: CheckedScene, here: np.ndarray, nearby: dict[int, np.ndarra
             "here and nearby: neither L nor a constraint determines the acceleration there. Add the kinetic energy of "
             "these velocities or a constraint on them, or take a coordinate out."
         )
-    if _homogeneous(scene, [0, *nearby]):
+    if _is_homogeneous(scene, [0, *nearby]):
         return "gauge", (
             "the velocity itself: L is of degree one in the velocities, and every parametrisation of the path is as "
             "good as another. Take one of the coordinates as t, or, where L is a length alone, integrate its square."
         )
-    if nearby and all(_spans(here, directions) for directions in nearby.values()):
+    if nearby and all(_span_same_space(here, directions) for directions in nearby.values()):
         return "velocity_combination", f"here and nearby: {_NO_ENERGY}"
     return "gauge", (
         "and nearby along directions that change with the state: a part of the motion is left free. Fix it by a "
@@ -124,14 +128,14 @@ def _classify(scene: CheckedScene, here: np.ndarray, nearby: dict[int, np.ndarra
     )
 
 
-def _homogeneous(scene: CheckedScene, states: list[int]) -> bool:
+def _is_homogeneous(scene: CheckedScene, states: list[int]) -> bool:
     """True if M q̇ = 0 at all of these states: L is of degree one in the velocities."""
     pairs = [(scene.measured.mass[k], v) for k in states if (v := scene.measured.velocity[k]).any()]
     least = np.sqrt(np.finfo(scene.layout.dtype).eps)
     return bool(pairs) and all(np.abs(m @ v).max() <= least * np.abs(m).max() * np.abs(v).max() for m, v in pairs)
 
 
-def _spans(one: np.ndarray, other: np.ndarray) -> bool:
+def _span_same_space(one: np.ndarray, other: np.ndarray) -> bool:
     """True if the rows of two arrays (k, n) span the same space, up to √eps."""
     beyond = one - one @ (basis := np.linalg.qr(other.T)[0]) @ basis.T if one.shape == other.shape else np.inf
     return bool(np.abs(beyond).max() < np.sqrt(np.finfo(one.dtype).eps))
@@ -151,7 +155,7 @@ def describe_direction(direction: np.ndarray, names: Sequence[str]) -> str:
 _NEARLY = 1e-6
 
 
-def _nearly_singular(here: np.ndarray, others: list[np.ndarray], names) -> list[Finding]:
+def _check_nearly_singular(here: np.ndarray, others: list[np.ndarray], names) -> list[Finding]:
     """A warning next to a pole, where K is regular in its own scale but nearly singular in that of states nearby."""
     if not others:
         return []
@@ -175,20 +179,20 @@ def _nearly_singular(here: np.ndarray, others: list[np.ndarray], names) -> list[
     return [Finding("near_coordinate_singularity", "warning", where, message)]
 
 
-def _signs(mass: np.ndarray, rows: np.ndarray, names) -> list[Finding]:
+def _check_signs(mass: np.ndarray, rows: np.ndarray, names) -> list[Finding]:
     """Negative kinetic energy along velocities that the constraints allow."""
     scaled, scale = unit_diagonal(mass)
     free = null_space(rows * scale)
     if not free.shape[1]:
         return []
     values, vectors = eigen(free.T @ scaled @ free)
-    negative = values < -_rounding(mass) * np.abs(values).max()
+    negative = values < -_rounding_fraction(mass) * np.abs(values).max()
     if not negative.any():
         return []
-    return [_indefinite(scale * (free @ vectors[:, 0]), bool(negative.all()), names)]
+    return [_indefinite_finding(scale * (free @ vectors[:, 0]), bool(negative.all()), names)]
 
 
-def _indefinite(direction: np.ndarray, everywhere: bool, names) -> Finding:
+def _indefinite_finding(direction: np.ndarray, everywhere: bool, names) -> Finding:
     combination = describe_direction(direction, names)
     where = tuple(name for name, c in zip(names, direction, strict=True) if abs(c) > 1e-6 * np.abs(direction).max())
     whole = "negative definite" if everywhere else "indefinite"
@@ -199,7 +203,7 @@ def _indefinite(direction: np.ndarray, everywhere: bool, names) -> Finding:
     )  # fmt: skip
 
 
-def _condition(matrix: np.ndarray, names, default_rtol: float) -> list[Finding]:
+def _check_condition(matrix: np.ndarray, names, default_rtol: float) -> list[Finding]:
     values, vectors = eigen(unit_diagonal(matrix)[0])
     with np.errstate(divide="ignore"):
         condition, raw = (np.abs(x).max() / np.abs(x).min() for x in (values, eigen(matrix)[0]))
@@ -229,7 +233,7 @@ def _large_findings(scene: CheckedScene, names) -> list[Finding]:
     if np.any(empty):
         linear = m.momentum.any(axis=0)
         groups = [(np.flatnonzero(empty & (linear == kind)), kind) for kind in (True, False)]
-        return [_empty(tuple(names[i] for i in of), kind, False) for of, kind in groups if len(of)]
+        return [_massless_finding(tuple(names[i] for i in of), kind, False) for of, kind in groups if len(of)]
     spectrum = sparse_spectrum(scene.derivation, scene.state)
     if spectrum is None:
         return []
@@ -239,5 +243,5 @@ def _large_findings(scene: CheckedScene, names) -> list[Finding]:
         message = f"The mass matrix d2L/dqdot2 is singular along {describe_direction(null, names)}: {_NO_ENERGY}"
         return [Finding("velocity_combination", "error", where, message)]
     condition = abs(largest / smallest)
-    reported = [_indefinite(downward, False, names)] if lowest < 0 else []
+    reported = [_indefinite_finding(downward, False, names)] if lowest < 0 else []
     return reported + _ill_conditioned(condition, "", null, names, DEFAULT_RTOL)

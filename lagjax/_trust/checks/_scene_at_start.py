@@ -39,10 +39,10 @@ class CheckedScene(NamedTuple):
         state = layout.flatten(q), layout.flatten(qdot), jnp.asarray(t), eqx.filter(params, eqx.is_array_like)
         flat = [np.asarray(x) for x in state[:3]]
         here = Sample.from_scene(system, layout, flat[0][None], flat[1][None], flat[2], params)
-        scales = _scales(here)
-        sizes = _sizes(q, qdot, scales)
-        steps, offsets = ladder(sizes, layout.dtype), _offsets(sizes, scales, layout.dtype)
-        return cls(system, layout, (q, qdot, t, params), state, here, sizes, steps, _measure(here, offsets))
+        scales = _state_scales(here)
+        sizes = _input_sizes(q, qdot, scales)
+        steps, offsets = ladder(sizes, layout.dtype), _nearby_offsets(sizes, scales, layout.dtype)
+        return cls(system, layout, (q, qdot, t, params), state, here, sizes, steps, _measure_states(here, offsets))
 
     @property
     def derivation(self) -> Derivation:
@@ -145,7 +145,7 @@ class CheckedScene(NamedTuple):
         m, n = self.measured, self.layout.size
         if m.acceleration is not None:
             return m.acceleration, np.zeros(0)
-        x = self._solve(np.concatenate([m.force, m.gamma])[:, None])[:, 0]
+        x = self._solve_saddle(np.concatenate([m.force, m.gamma])[:, None])[:, 0]
         return x[:n], x[n:]
 
     def jacobian(self) -> np.ndarray:
@@ -154,9 +154,9 @@ class CheckedScene(NamedTuple):
             varied = _program_variation(self.derivation, self.state, *self.solve_saddle())
         except Unlowerable:
             return np.concatenate(_acceleration_slopes(self.system, *self.arguments), axis=1)
-        return self._solve(-varied)[: self.layout.size]
+        return self._solve_saddle(-varied)[: self.layout.size]
 
-    def _solve(self, b: np.ndarray) -> np.ndarray:
+    def _solve_saddle(self, b: np.ndarray) -> np.ndarray:
         """(q̈, λ) of the saddle point M q̈ − Gᵀλ = b₁, G q̈ = b₂ for columns b (n + m, k); NaN where it is singular."""
         above, below = np.split(b[None], [self.layout.size], axis=1)
         return np.concatenate(saddle_many(self.measured.mass[:1], above, self.measured.jacobian[:1], below), axis=1)[0]
@@ -198,7 +198,7 @@ class Sides(NamedTuple):
     round_off: Any  # how far it may move by_q, momentum, mass, drift, by_v_of_dissipation and the rows of G, each alike
 
 
-def _scales(here: Sample) -> Scales:
+def _state_scales(here: Sample) -> Scales:
     """The sizes of coordinates, velocities and the time at a state; one, where the scene does not tell."""
     q, v, t = (np.asarray(x, np.float64) for x in (here.q[0], here.qdot[0], here.t))
 
@@ -212,7 +212,7 @@ def _scales(here: Sample) -> Scales:
     return scales._replace(**{name: np.where(np.isfinite(x) & (x > 0), x, 1.0) for name, x in scales._asdict().items()})
 
 
-def _sizes(q: PyTree, qdot: PyTree, scales: Scales) -> np.ndarray:
+def _input_sizes(q: PyTree, qdot: PyTree, scales: Scales) -> np.ndarray:
     """The size of every coordinate, of every velocity, and of the time along the motion, (2n + 1,).
 
     A coordinate has its absolute value as its size; where that is zero, the largest in its array, or its scale. One
@@ -232,7 +232,7 @@ def _sizes(q: PyTree, qdot: PyTree, scales: Scales) -> np.ndarray:
     return np.concatenate([of_q, of_v, [time]])
 
 
-def _offsets(sizes: np.ndarray, scales: Scales, dtype) -> np.ndarray:
+def _nearby_offsets(sizes: np.ndarray, scales: Scales, dtype) -> np.ndarray:
     """Offsets (1 + 2 · _NEARBY, 2n) from the state: zero, then random ones of q alone, then of q̇ alone."""
     # Their deviation is a tenth of the sizes. A coordinate that is small beside the others moves by a tenth of its
     # scale: it may be next to where the chart is singular, and has to leave that.
@@ -251,7 +251,7 @@ _PRODUCTS = ("mass_by_some", "jacobian_by_some", "acceleration")  # in the place
 _DERIVED = ("lagrangian_by_q", "momentum", "mass_matrix", "given_force", "dissipation_by_qdot", "force", "jacobian")
 
 
-def _measure(here: Sample, offsets: np.ndarray) -> Measured:
+def _measure_states(here: Sample, offsets: np.ndarray) -> Measured:
     """The measurements at the state and at `offsets` (states, 2n) from it."""
     n = here.derivation.layout.size
     velocity = here.qdot + offsets[:, n:]

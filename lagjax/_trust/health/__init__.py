@@ -70,12 +70,12 @@ def examine(trajectory, reference=None) -> "Health":
         impacts=impacts,
         doubts=doubts,
         outputs=trajectory.ts.shape[-1],
-        diagnosis=_diagnosis(trajectory),
+        diagnosis=_first_diagnosis(trajectory),
         **fields,
     )
 
 
-def _diagnosis(trajectory) -> str:
+def _first_diagnosis(trajectory) -> str:
     """The obstacle of the first member that failed; nothing where none did, or where that is being traced."""
     concrete = all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory))
     if not isinstance(trajectory.system, System) or not concrete:
@@ -204,19 +204,19 @@ class Health(eqx.Module):
     @property
     def suspicious(self) -> Bool[Array, "*batch"]:
         """True if any of the `checks` is, for each member."""
-        flags, xp = self._flags()
+        flags, xp = self._health_flags()
         return jnp.asarray(xp.any(xp.stack(list(flags.values())), axis=0))
 
     def checks(self) -> dict[str, Bool[Array, "*batch"]]:
         """The suspicions, by name: a Boolean for each member. A NaN at a state that was reached is."""
-        return {name: jnp.asarray(flag) for name, flag in self._flags()[0].items()}
+        return {name: jnp.asarray(flag) for name, flag in self._health_flags()[0].items()}
 
     @property
     def _energy_limit(self):
         """The imbalance of energy beyond which it is suspicious: what is allowed, and what the outputs leave open."""
         return self.energy_allowed + SLACK * self.work_error
 
-    def _flags(self) -> tuple[dict, Any]:
+    def _health_flags(self) -> tuple[dict, Any]:
         """`checks`, and the library they are computed in: NumPy where nothing is being traced."""
         concrete = all(is_concrete(leaf) for leaf in jax.tree.leaves(self))
         xp = np if concrete else jnp
@@ -225,11 +225,11 @@ class Health(eqx.Module):
         with np.errstate(invalid="ignore"):
             flags = {
                 "result": ~of.ok,
-                "energy": _exceeds(xp, of.energy, of._energy_limit) & ~(of.outputs_needed > of.outputs),
+                "energy": _exceeds_limit(xp, of.energy, of._energy_limit) & ~(of.outputs_needed > of.outputs),
                 "amplitude": of.amplitude < of.amplitude_needed,
-                "momentum": _exceeds(xp, of.momentum, of.momentum_allowed).any(axis=-1),
-                "constraints": _exceeds(xp, of.constraint_distance, of.constraint_allowed[..., :1]).any(axis=-1)
-                | _exceeds(xp, of.constraint_rate, of.constraint_allowed[..., 1:]).any(axis=-1),
+                "momentum": _exceeds_limit(xp, of.momentum, of.momentum_allowed).any(axis=-1),
+                "constraints": _exceeds_limit(xp, of.constraint_distance, of.constraint_allowed[..., :1]).any(axis=-1)
+                | _exceeds_limit(xp, of.constraint_rate, of.constraint_allowed[..., 1:]).any(axis=-1),
                 "gradients": ~of.gradients_finite,
                 "steps": of.rejected_steps > xp.maximum(UNSTEADY * tries, 20),
             }
@@ -244,14 +244,14 @@ class Health(eqx.Module):
             if of.doubts is not None:
                 flags |= {name: of.doubts[0][..., k] > 0 for k, name in enumerate(_DOUBTS)}
             if of.scaled_condition is not None:
-                flags["mass_matrix"] = _exceeds(xp, of.scaled_condition, of.scaled_condition_allowed)
+                flags["mass_matrix"] = _exceeds_limit(xp, of.scaled_condition, of.scaled_condition_allowed)
             if of.global_error is not None:
-                flags["global_error"] = _exceeds(xp, of.global_error, VISIBLE)
+                flags["global_error"] = _exceeds_limit(xp, of.global_error, VISIBLE)
         return flags, xp
 
     def findings(self) -> tuple[str, ...]:
         """Sentences about what is suspicious or cannot be told, which say what to do; none where all is well."""
-        flags = self._flags()[0]
+        flags = self._health_flags()[0]
         raised = {name: np.asarray(flags[name]) for name in _SENTENCES if name in flags and np.any(flags[name])}
         sides = "" if self.borders_located else "make it an event or a mode, or "
         sentences = {name: _SENTENCES[name].format(_member_share(members), sides) for name, members in raised.items()}
@@ -271,9 +271,9 @@ class Health(eqx.Module):
             # The atol whose ratio to this motion is that of the present atol to a motion of order one.
             wanted = np.where(raised["amplitude"], np.asarray(self.amplitude * self.amplitude_needed), np.inf)
             sentences["amplitude"] += f"{np.min(wanted) / SMALLEST:.0e}."
-        return (*sentences.values(), *self._undecided())
+        return (*sentences.values(), *self._explain_undecided())
 
-    def _undecided(self) -> tuple[str, ...]:
+    def _explain_undecided(self) -> tuple[str, ...]:
         """A sentence where the outputs are too few to tell whether the power is balanced."""
         outputs, needed = np.asarray(self.outputs), np.asarray(self.outputs_needed)
         undecided = needed > outputs
@@ -293,12 +293,12 @@ class Health(eqx.Module):
     _repr_pretty_ = show_str
 
     def __str__(self) -> str:
-        rows = [("result", self._results()), ("steps", self._steps())]
+        rows = [("result", self._result_rows()), ("steps", self._step_rows())]
         error = np.max(np.nan_to_num(np.asarray(self.work_error, float), nan=-np.inf))
         known = f"; the work between outputs is known to {error:.1e}" if self.works else ""
         law = "power balance" if self.works else "energy"
         if self.impacts is None:
-            rows.append((law, f"off by {_worst(self.energy, self._energy_limit)}{known}"))
+            rows.append((law, f"off by {_find_worst(self.energy, self._energy_limit)}{known}"))
         else:
             count, lost, shared, t = (np.asarray(x) for x in self.impacts)
             took = f"{count.sum()}, which took an energy of {np.sum(lost):.3g} away"
@@ -321,13 +321,13 @@ class Health(eqx.Module):
         else:
             smallest = Extreme(-np.asarray(self.smallest_eigenvalue.value), self.smallest_eigenvalue.t)
             rows += [
-                ("mass matrix", f"smallest eigenvalue {_worst(smallest, sign=-1)}"),
-                ("", f"condition {_worst(self.condition)}"),
-                ("", f"scaled to a unit diagonal {_worst(self.scaled_condition, self.scaled_condition_allowed)}"),
+                ("mass matrix", f"smallest eigenvalue {_find_worst(smallest, sign=-1)}"),
+                ("", f"condition {_find_worst(self.condition)}"),
+                ("", f"scaled to a unit diagonal {_find_worst(self.scaled_condition, self.scaled_condition_allowed)}"),
             ]
         rows.append(("gradients", "finite" if np.all(self.gradients_finite) else "not finite"))
         if self.global_error is not None:
-            rows.append(("global error", f"{_worst(self.global_error, VISIBLE)}, in units of the largest |y|"))
+            rows.append(("global error", f"{_find_worst(self.global_error, VISIBLE)}, in units of the largest |y|"))
         verdict = self.findings() or ("nothing suspicious",)
         lines = [line for text in verdict for line in textwrap.wrap(text, 100)]
         rows += [("" if k else "verdict", line) for k, line in enumerate(lines)]
@@ -345,25 +345,25 @@ class Health(eqx.Module):
             parts.append(f"{most}{grazed.max()} grazed, the first at t = {np.nanmin(np.asarray(self.borders.t)):.6g}")
         return "; ".join(parts)
 
-    def _results(self) -> str:
+    def _result_rows(self) -> str:
         codes, counts = np.unique(np.asarray(self.result._value), return_counts=True)
         if self.ok.ndim == 0:
             return name_of(codes[0])
         listed = [f"{counts[k]} {name_of(codes[k])}" for k in np.argsort(-counts)]
         return f"of {self.ok.size} members " + ", ".join(listed)
 
-    def _steps(self) -> str:
+    def _step_rows(self) -> str:
         accepted, rejected = (np.asarray(x).ravel() for x in (self.accepted_steps, self.rejected_steps))
         if self.ok.ndim == 0:
             return f"{accepted[0]} accepted, {rejected[0]} rejected"
         return f"{np.median(accepted):.0f} accepted, at most {accepted.max()}; at most {rejected.max()} rejected"
 
 
-def _exceeds(xp, extreme: Extreme, allowed):
+def _exceeds_limit(xp, extreme: Extreme, allowed):
     return ~xp.isnan(extreme.t) & ~(extreme.value <= allowed)
 
 
-def _worst(extreme: Extreme, allowed=None, sign: int = 1) -> str:
+def _find_worst(extreme: Extreme, allowed=None, sign: int = 1) -> str:
     """The largest value of all members, where and when; `sign` undoes a change of sign made to rank them."""
     values, times = np.asarray(extreme.value, float), np.asarray(extreme.t, float)
     if np.isnan(times).all():
@@ -386,7 +386,7 @@ def _worst_row(label: str, names: tuple[str, ...], extreme: Extreme, allowed) ->
     which = int(np.argmax(np.max(part, axis=0)))
     picked = Extreme(extreme.value[..., which], extreme.t[..., which])
     of = names[which] if len(names) == 1 else f"worst of {len(names)}: {names[which]}"
-    return [(label, f"{of} off by {_worst(picked, allowed[..., which])}")]
+    return [(label, f"{of} off by {_find_worst(picked, allowed[..., which])}")]
 
 
 def _member_share(flags: np.ndarray) -> str:

@@ -55,7 +55,7 @@ def count_borders(members: Members) -> tuple[bool, Met | None]:
     moved = np.flatnonzero(np.isfinite(start).all(axis=1) & (ts[:, 1] != ts[:, 0]) & (steps > 0))
     for some in portions(moved, steps * (flow.states + 5 + len(flow.kernel.borders.switches)), LARGEST_COUNTED):
         tolerances = Tolerances(rtol, atol, 2 * int(steps[some].max()) + 100)
-        _count(flow, ts[some], start[some], params[some], tolerances, steps[some], some, nothing)
+        _count_contacts(flow, ts[some], start[some], params[some], tolerances, steps[some], some, nothing)
     return True, nothing
 
 
@@ -68,7 +68,7 @@ def is_piecewise(system: System, layout: Layout, params) -> bool:
         return bool(pieces_of_motion(derivation.motion, *derivation.state_shapes))
 
 
-def _count(flow: Flow, ts, y0, params, tolerances: Tolerances, steps, places, into: Met) -> None:
+def _count_contacts(flow: Flow, ts, y0, params, tolerances: Tolerances, steps, places, into: Met) -> None:
     """Follow some motions, and add what they met `into` the counts at their places."""
     borders = flow.kernel.borders
     assert borders is not None  # without a series there are none, and none are counted

@@ -22,7 +22,7 @@ def global_error(trajectory, reference) -> Extreme:
         rtol, atol = trajectory.tolerances
         floor = atol / rtol
         floor = jnp.reshape(floor, jnp.shape(floor) + (1,) * (jnp.ndim(trajectory.ok) + 1 - jnp.ndim(floor)))
-    return _global_error(*(_states(one) for one in (trajectory, reference)), trajectory.ts, floor)
+    return _global_error(*(_output_states(one) for one in (trajectory, reference)), trajectory.ts, floor)
 
 
 def require_comparable(trajectory, reference) -> None:
@@ -34,12 +34,12 @@ def require_comparable(trajectory, reference) -> None:
         if ours != theirs:
             raise ValueError(f"The reference must have the shapes of the trajectory: {name} is {ours}, there {theirs}.")
     eps = max(float(jnp.finfo(jnp.result_type(one.ts)).eps) for one in (trajectory, reference))
-    if not _agree(trajectory.ts, reference.ts, eps):
+    if not _arrays_agree(trajectory.ts, reference.ts, eps):
         raise ValueError("The reference has different output times: integrate it with ts=trajectory.ts.")
     if not eqx.tree_equal(trajectory.system, reference.system):
         raise ValueError("The reference is a motion of another system: integrate it with system=trajectory.system.")
     numbers = [jax.tree.leaves(eqx.filter(one.params, eqx.is_array_like)) for one in (trajectory, reference)]
-    if not all(jnp.shape(a) == jnp.shape(b) and _agree(a, b, eps) for a, b in zip(*numbers, strict=True)):
+    if not all(jnp.shape(a) == jnp.shape(b) and _arrays_agree(a, b, eps) for a, b in zip(*numbers, strict=True)):
         raise ValueError("The reference has different parameters: integrate it with params=trajectory.params.")
     rtols = [one.tolerances and one.tolerances[0] for one in (trajectory, reference)]
     if all(rtol is not None and is_concrete(rtol) for rtol in rtols):
@@ -51,7 +51,7 @@ def require_comparable(trajectory, reference) -> None:
             )
 
 
-def _agree(ours, theirs, eps: float) -> bool:
+def _arrays_agree(ours, theirs, eps: float) -> bool:
     """True if two arrays agree to 4 eps; values that are being traced cannot be compared, and count as equal."""
     if not (is_concrete(ours) and is_concrete(theirs)):
         return True
@@ -59,7 +59,7 @@ def _agree(ours, theirs, eps: float) -> bool:
     return bool(np.all(np.abs(ours - theirs) <= 4 * eps * np.max(np.abs(theirs), initial=0.0)))
 
 
-def _states(trajectory) -> jax.Array:
+def _output_states(trajectory) -> jax.Array:
     """The states (q, q̇) at all outputs, (..., T, 2n)."""
     axes = jnp.ndim(trajectory.ok) + 1
     leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves((trajectory.q, trajectory.qdot))]

@@ -2,7 +2,7 @@
 
 `Law.measurements` takes a `Sample` of many states, which programs evaluate in NumPy without compiling anything;
 `Law.measurements_at` takes one state in JAX: for values that are being traced, and for scenes without programs. Both
-give the quantities of the scene to `_measure`, which holds the laws, for arrays of either library.
+give the quantities of the scene to `_measure_path`, which holds the laws, for arrays of either library.
 """
 
 from functools import partial
@@ -71,7 +71,7 @@ class Law(NamedTuple):
         """The law of a system; `mode`, where it is not empty, is a prefix of the names of constraints."""
         derivation = derivation_of(system, layout, params)
         names = system.constraint_names(layout, params) if derivation.motion.constrained else []
-        works, conserved = (True, ()) if system.touches else _constants(system, derivation)
+        works, conserved = (True, ()) if system.touches else _conservation_flags(system, derivation)
         return cls(derivation, works, conserved, tuple((f"{mode}: " if mode else "") + name for name in names))
 
     # ---- many states, by programs ----
@@ -82,7 +82,7 @@ class Law(NamedTuple):
         def measure_part(part: Sample, *tolerances) -> Measurements:
             of, by_q = part.quantities(*_QUANTITIES), part.momenta_by_q(momenta)
             columns = [np.reshape(x, (-1, 1)) for x in tolerances]
-            return self._measure(momenta, columns, part.q, part.qdot, of, by_q, self._finite(part))
+            return self._measure_path(momenta, columns, part.q, part.qdot, of, by_q, self._derivatives_finite(part))
 
         return sample.evaluate_in_parts(measure_part, self._portion(_QUANTITIES), *tolerances)
 
@@ -90,7 +90,7 @@ class Law(NamedTuple):
         """dh/dt at S states, shape (S,)."""
         names = (*_SOURCES, *(SADDLE if self.motion.constrained else ()))
         return sample.evaluate_in_parts(
-            lambda part: self._power(part.quantities(*names), part.qdot), self._portion(_QUANTITIES)
+            lambda part: self._energy_power(part.quantities(*names), part.qdot), self._portion(_QUANTITIES)
         )
 
     def accelerations(self, sample: Sample) -> np.ndarray:
@@ -100,7 +100,7 @@ class Law(NamedTuple):
     def _portion(self, names: tuple[str, ...]) -> int:
         return max(1, _CHUNK // sum(self.derivation.count(name) for name in names))
 
-    def _finite(self, sample: Sample) -> np.ndarray:
+    def _derivatives_finite(self, sample: Sample) -> np.ndarray:
         """True if M, F, G and γ have finite derivatives by all inputs at S states, (S,)."""
         # One transposed derivative of the sum of them all is taken, which a single NaN makes NaN. The program's own
         # operations answer first. Where they say no, the program may have written a power as a root, or the user may
@@ -137,19 +137,19 @@ class Law(NamedTuple):
             units = jnp.zeros((len(momenta), q.size), q.dtype).at[np.arange(len(momenta)), chosen].set(1.0)
             mass = _conditions_of_diagonal(of["mass_diagonal"]) if self.knows_mass else jnp.full(3, jnp.nan, q.dtype)
             of |= {"momenta_by_qdot": jax.vmap(motion.mass_product(*state))(units), "mass": mass}
-        return self._measure(momenta, tolerances, q, qdot, of, by_q, finite)
+        return self._measure_path(momenta, tolerances, q, qdot, of, by_q, finite)
 
     def power_at(self, q, qdot, t, params) -> jax.Array:
-        return self._power(self.motion.quantities(q, qdot, t, params), qdot)
+        return self._energy_power(self.motion.quantities(q, qdot, t, params), qdot)
 
     # ---- the laws ----
 
     @np.errstate(all="ignore")
-    def _measure(self, momenta, tolerances, q, qdot, of, momenta_by_q, finite) -> Measurements:
+    def _measure_path(self, momenta, tolerances, q, qdot, of, momenta_by_q, finite) -> Measurements:
         """The `Measurements` of q, q̇ (…, n) from their quantities `of`, ∂pᵢ/∂q (…, k − 1, n) and `finite` (…)."""
         # Arrays of NumPy have an axis of states, those of JAX none.
         xp, (rtol, atol), chosen = qdot.__array_namespace__(), tolerances, np.array(momenta, int)
-        of = of if "mass_matrix" not in of else of | _products(xp, of["mass_matrix"], of["jacobian"], qdot, chosen)
+        of = of if "mass_matrix" not in of else of | _mass_products(xp, of["mass_matrix"], of["jacobian"], qdot, chosen)
         momentum, far, fast = of["momentum"], xp.abs(q), xp.abs(qdot)
         energy = xp.einsum("...i,...i->...", momentum, qdot) - of["lagrangian"]
         by_q = xp.abs(xp.concatenate([of["energy_by_q"][..., None, :], momenta_by_q], axis=-2))
@@ -165,7 +165,7 @@ class Law(NamedTuple):
             conserved=xp.concatenate([energy[..., None], momentum[..., chosen]], axis=-1),
             slopes=add_changes(rtol * far + atol, rtol * fast + atol),
             sizes=add_changes(far, fast) + is_energy * terms[..., None],
-            power=self._power(of, qdot),
+            power=self._energy_power(of, qdot),
             acceleration=solve_saddle(of)[0] if self.works else xp.zeros_like(q),
             distances=off_q,
             rates=off_qdot,
@@ -174,7 +174,7 @@ class Law(NamedTuple):
         )
 
     @np.errstate(all="ignore")
-    def _power(self, of: dict[str, Any], qdot):
+    def _energy_power(self, of: dict[str, Any], qdot):
         """dh/dt = −∂L/∂t + Q·q̇ + λ·(G q̇), where G q̇ = −∂f/∂t, and −a(q, 0, t) for velocities, (…)."""
         xp = qdot.__array_namespace__()
         if not self.works:
@@ -189,7 +189,7 @@ _SOURCES = ("lagrangian_by_t", "nonconservative_force", "driving")
 _QUANTITIES = ("lagrangian", "momentum", "energy_by_q", "residual", "rates", *SADDLE, *_SOURCES)
 
 
-def _products(xp, mass, jacobian, qdot, chosen) -> dict[str, Any]:
+def _mass_products(xp, mass, jacobian, qdot, chosen) -> dict[str, Any]:
     """M q̇, the rows of M of the `chosen` coordinates, the lengths of the rows of G and what `_conditions` gives."""
     return {
         "energy_by_qdot": xp.einsum("...ij,...j->...i", mass, qdot),
@@ -234,7 +234,7 @@ def _eigenvalues(xp, matrix):
     return xp.where(finite[..., None], xp.linalg.eigvalsh(usable), np.nan)
 
 
-def _constants(system: System, derivation: Derivation) -> tuple[bool, tuple[int, ...] | None]:
+def _conservation_flags(system: System, derivation: Derivation) -> tuple[bool, tuple[int, ...] | None]:
     """A flag that anything does work, and the coordinates on which no force of any kind acts (None: not known)."""
     try:
         return derivation.works, derivation.conserved

@@ -86,17 +86,17 @@ def measure_trajectory(trajectory) -> dict[str, Any]:
 def _report_in_doubles(members: Members) -> dict[str, Any] | None:
     """The report of all members, whose laws are those of float64; None where a scene has no programs."""
     layout = dataclasses.replace(members.layout, dtype=DOUBLE)
-    laws = _laws(members.trajectory, layout, widen(members.params))
+    laws = _mode_laws(members.trajectory, layout, widen(members.params))
     if not all(law.derivation.is_lowered for law in laws):
         return None
-    return _report_of(members, laws) | _names(laws, layout)
+    return _report_of(members, laws) | _known_fields(laws, layout)
 
 
 def _precision_of(trajectory, q) -> np.dtype:
     return q.dtype if trajectory.engine == "Diffrax" else DOUBLE
 
 
-def _laws(trajectory, layout: Layout, params) -> list[Law]:
+def _mode_laws(trajectory, layout: Layout, params) -> list[Law]:
     modes = {"": trajectory.system}
     if isinstance(trajectory.system, dict):
         modes = {name: trajectory.system[name] for name in trajectory.mode_names}
@@ -106,12 +106,12 @@ def _laws(trajectory, layout: Layout, params) -> list[Law]:
 def does_work(trajectory) -> bool:
     """True if anything does work in some mode of a motion, so that its energy is not constant."""
     members = Members(trajectory)
-    return any(law.works for law in _laws(trajectory, members.layout, members.params))
+    return any(law.works for law in _mode_laws(trajectory, members.layout, members.params))
 
 
-def _names(laws: list[Law], layout: Layout) -> dict[str, Any]:
+def _known_fields(laws: list[Law], layout: Layout) -> dict[str, Any]:
     """The fields of `Health` that are known without a motion, none of them an array."""
-    momenta = _conserved(laws)
+    momenta = _common_conserved(laws)
     return {
         "works": any(law.works for law in laws),
         "momentum_names": None if momenta is None else tuple(layout.names[i] for i in momenta),
@@ -119,7 +119,7 @@ def _names(laws: list[Law], layout: Layout) -> dict[str, Any]:
     }
 
 
-def _conserved(laws: list[Law]) -> tuple[int, ...] | None:
+def _common_conserved(laws: list[Law]) -> tuple[int, ...] | None:
     if any(law.conserved is None for law in laws):
         return None
     return tuple(sorted({i for law in laws for i in law.conserved or ()}))
@@ -143,7 +143,7 @@ def path_of(members: Members) -> SampledPath:
 
 def _report_of(members: Members, laws: list[Law]) -> dict[str, Any]:
     """The fields of `Health` that are measured, with the batch axes of the trajectory."""
-    path, momenta = path_of(members), _conserved(laws) or ()
+    path, momenta = path_of(members), _common_conserved(laws) or ()
 
     def evaluate_by_mode(function: Callable, q, qdot, t, mode):
         """`function(law, index, member, sample)` on the states of each mode, in the order of all states, (N, S, …)."""
@@ -192,13 +192,13 @@ def _measure_traced(trajectory, axes, tree, steps):
 
     def one(q, qdot, times_and_tolerances, params, mode, steps, transitions):
         layout = Layout.from_state(*jax.tree.map(lambda leaf: leaf[0], (q, qdot)))
-        laws = _laws(trajectory, layout, params)
-        names.update(_names(laws, layout))
+        laws = _mode_laws(trajectory, layout, params)
+        names.update(_known_fields(laws, layout))
         flat, (ts, tolerances) = jax.vmap(layout.flatten), times_and_tolerances
         more = transitions and (flat(transitions.q), flat(transitions.qdot), transitions.t, transitions.source)
         outputs, precision = (flat(q), flat(qdot), ts, mode), _precision_of(trajectory, layout)
         path = _join_states(jnp, outputs, more, steps, tolerances, precision)
-        momenta, numbers = _conserved(laws) or (), eqx.filter(params, eqx.is_array)
+        momenta, numbers = _common_conserved(laws) or (), eqx.filter(params, eqx.is_array)
         tolerances = (0.0, 0.0) if path.tolerances is None else path.tolerances
         size = _CHUNK // (members * max(numbers_of_state(law.derivation) for law in laws))
 
@@ -237,7 +237,7 @@ def _join_states(xp, outputs: tuple, transitions: tuple | None, steps, tolerance
     ends = xp.broadcast_to(xp.arange(1, ts.shape[-1]), (*ts.shape[:-1], ts.shape[-1] - 1))
     t, mode, dtype = ts, xp.zeros(ts.shape, int) if mode is None else mode, q.dtype
     if transitions is not None:
-        ends = _ends(xp, ts, transitions[2])
+        ends = _law_ends(xp, ts, transitions[2])
         q, qdot, t, mode = (
             xp.concatenate(pair, axis=ts.ndim - 1) for pair in zip((q, qdot, t, mode), transitions, strict=True)
         )
@@ -270,7 +270,7 @@ def _report(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample
     drifts, work_error = _drifts(path, laws, momenta, samples, reached, between)
     here = jax.tree.map(lambda leaf: leaf[(slice(None),) * axis + (slice(T),)], samples)
     on_path, most = reached[..., :T], partial(extreme, xp, axis, path.ts)
-    limits, size = _limits(path, here, on_path)
+    limits, size = _drift_limits(path, here, on_path)
     owner = np.repeat(np.arange(len(laws)), [len(law.names) for law in laws])
     in_force = on_path[..., None] & (mode[..., :T, None] == owner)
     far, fast = (xp.max(xp.where(on_path[..., None], xp.abs(x[..., :T, :]), 0.0), axis=(-2, -1)) for x in (q, qdot))
@@ -287,8 +287,8 @@ def _report(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample
         "energy": energy,
         "energy_allowed": limits[..., 0],
         "work_error": work_error,
-        "outputs_needed": _outputs_needed(xp, T, energy.value, work_error, size[..., 0]),
-        "amplitude": _amplitude(xp, q[..., :T, :], on_path),
+        "outputs_needed": _count_outputs_needed(xp, T, energy.value, work_error, size[..., 0]),
+        "amplitude": _largest_excursion(xp, q[..., :T, :], on_path),
         "amplitude_needed": none if fixed else SMALLEST * path.tolerances[1] + none,
         "momentum": most(drifts[..., 1:], on_path),
         "momentum_allowed": limits[..., 1:],
@@ -304,7 +304,7 @@ def _report(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample
     }
 
 
-def _ends(xp, ts, transitions):
+def _law_ends(xp, ts, transitions):
     """The index (…, T − 1) of the state where the law of each output ends: the next output or a transition before."""
     T = ts.shape[-1]
     times = xp.where(xp.isnan(transitions), math.inf, transitions)
@@ -324,7 +324,7 @@ def _drifts(path: SampledPath, laws, momenta, samples: Measurements, reached, be
     measurable = until(reached) & reached[..., : T - 1]
     work, work_error = xp.zeros_like(start[..., 0]), xp.zeros_like(start[..., 0, 0])
     if any(law.works for law in laws):
-        work, work_error = _work(path, samples, measurable, between)
+        work, work_error = _work_integrals(path, samples, measurable, between)
     expected = xp.concatenate([work[..., None], xp.zeros_like(start[..., 1:])], axis=-1)
     conserves = xp.asarray(np.array([[True, *(i in (law.conserved or ()) for i in momenta)] for law in laws]))
     counted = conserves[xp.maximum(until(path.mode), 0)] & measurable[..., None]
@@ -344,14 +344,14 @@ class Rates(NamedTuple):
     decided: Callable | None = None
 
 
-def _gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
+def _gauss_rule(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Points and weights of Gauss and Legendre on (0, 1): exact for polynomials of degree 2 count − 1."""
     points, weights = np.polynomial.legendre.leggauss(count)
     return points / 2 + 0.5, weights / 2
 
 
-_POINTS, _WEIGHTS = _gauss(4)
-_MORE_POINTS, _MORE_WEIGHTS = _gauss(8)
+_POINTS, _WEIGHTS = _gauss_rule(4)
+_MORE_POINTS, _MORE_WEIGHTS = _gauss_rule(8)
 # s³ (1 − s)³ and s⁴ (1 − s)³ as rows of coefficients of s⁰ … s⁷, and the combinations of them whose second derivative
 # is 1 at one and 0 at the other of two points; at these neither of them is near zero, as it would be at 0.3.
 _CHECKED = np.array([0.4, 0.6])
@@ -361,7 +361,7 @@ _CORRECTIONS = np.linalg.inv(_BENDS).T @ _VANISHING  # (2, 8)
 INSIDE = 1e-9  # how far from its ends a piece of the path is asked what its program decides there
 
 
-def _work(path: SampledPath, samples: Measurements, measurable, between: Rates) -> tuple[Any, Any]:
+def _work_integrals(path: SampledPath, samples: Measurements, measurable, between: Rates) -> tuple[Any, Any]:
     """∫ P dt over every piece, (…, T − 1), and the error of their sum, (…).
 
     Between its ends the motion is replaced by polynomials. The quintic through q, q̇ and q̈ is off by order six in q, and
@@ -374,11 +374,11 @@ def _work(path: SampledPath, samples: Measurements, measurable, between: Rates) 
     (q, v, a, p), dtype = (path.q, path.qdot, samples.acceleration, samples.power), path.q.dtype
     h = until(path.t) - path.t[..., :last]
     first, second = h[..., None], (h**2)[..., None]
-    cubic, quintic = _interpolants(
+    cubic, quintic = _hermite_interpolants(
         *((at(q), first * at(v), second * at(a)) for at in (lambda x: x[..., :last, :], until))
     )
     checked, corrections = _CHECKED.astype(dtype), _CORRECTIONS.astype(dtype)
-    bends = _combine(quintic, [k * (k - 1) * checked ** max(k - 2, 0) for k in range(6)])
+    bends = _combine_curves(quintic, [k * (k - 1) * checked ** max(k - 2, 0) for k in range(6)])
     defects = second[..., None] * _evaluate_on_curves(path, quintic, between.acceleration, checked) - bends
     fixes = [sum(defects[..., i, :] * corrections[i, k] for i in range(len(corrections))) for k in range(8)]
     septic = [*(c + fix for c, fix in zip(quintic, fixes, strict=False)), *fixes[6:]]
@@ -392,7 +392,7 @@ def _work(path: SampledPath, samples: Measurements, measurable, between: Rates) 
     fourth, sixth = (integrate(of, _POINTS, _WEIGHTS) for of in (cubic, quintic))
     found = xp.stack([trapezoidal, fourth, sixth, integrate(septic, _MORE_POINTS, _MORE_WEIGHTS)])
     smooth = xp.isfinite(found).all(axis=0)  # elsewhere the error is not known
-    error = _error_of_work(xp, found)
+    error = _work_error(xp, found)
     if between.decided is not None:
         inside = np.concatenate([[INSIDE], _POINTS.astype(dtype), [1 - INSIDE]])
         pieces, values = (_evaluate_on_curves(path, quintic, of, inside) for of in (between.decided, between.power))
@@ -402,7 +402,7 @@ def _work(path: SampledPath, samples: Measurements, measurable, between: Rates) 
     return xp.where(smooth, found[3], trapezoidal), xp.sum(xp.where(measurable, error, 0.0), axis=-1)
 
 
-def _combine(coefficients, powers) -> Any:
+def _combine_curves(coefficients, powers) -> Any:
     """Σ cₖ pₖ of coefficients (…, T − 1, n) and powers (S,), (…, T − 1, S, n)."""
     return sum(c[..., None, :] * x[:, None] for c, x in zip(coefficients, powers, strict=True))
 
@@ -412,8 +412,8 @@ def _evaluate_on_curves(path: SampledPath, coefficients, function: Callable, poi
     xp, until, last = path.library, path.take_ends, path.ts.shape[-1] - 1
     t, degrees = path.t[..., :last], range(len(coefficients))
     h = until(path.t) - t
-    at = _combine(coefficients, [points**k for k in degrees])
-    velocities = _combine(coefficients, [k * points ** max(k - 1, 0) for k in degrees]) / h[..., None, None]
+    at = _combine_curves(coefficients, [points**k for k in degrees])
+    velocities = _combine_curves(coefficients, [k * points ** max(k - 1, 0) for k in degrees]) / h[..., None, None]
     times = t[..., None] + h[..., None] * points
     modes = xp.broadcast_to(xp.maximum(until(path.mode), 0)[..., None], times.shape)
     shape = at.shape[:-3] + (-1,)
@@ -423,7 +423,7 @@ def _evaluate_on_curves(path: SampledPath, coefficients, function: Callable, poi
     return found.reshape(times.shape + found.shape[len(shape) :])
 
 
-def _interpolants(begin, end) -> tuple[list, list]:
+def _hermite_interpolants(begin, end) -> tuple[list, list]:
     """Coefficients of s⁰, s¹, … of the cubic with these q and dq/ds at s = 0 and 1, and of the quintic with d²q/ds²."""
     (q0, v0, a0), (q1, v1, a1) = begin, end
     a0, rise = a0 / 2, q1 - q0
@@ -433,7 +433,7 @@ def _interpolants(begin, end) -> tuple[list, list]:
     return [q0, v0, 3 * rise - 2 * v0 - v1, v0 + v1 - 2 * rise], [q0, v0, a0, *last]
 
 
-def _error_of_work(xp, found):
+def _work_error(xp, found):
     """The error of the work of every piece, from its values `found` (4, …) by rules of order 2, 4, 6 and 8."""
     # Once pieces are short enough, errors fall from order to order by the same factor, or a larger one; one of the
     # first two may be small by accident. Where they do not fall eightfold each, the pieces are longer than what they
@@ -445,7 +445,7 @@ def _error_of_work(xp, found):
     return xp.where(finest <= largest / 64, finest, xp.maximum(finest, largest))
 
 
-def _outputs_needed(xp, T: int, imbalance, work_error, size):
+def _count_outputs_needed(xp, T: int, imbalance, work_error, size):
     """About how many outputs it takes to tell whether the power is balanced; T where the present ones do."""
     # They do not where the balance is off by more than `VISIBLE` of the energy and the error of the work may be as
     # large as both. That error is of order six, so that a sixth root gives the number.
@@ -455,7 +455,7 @@ def _outputs_needed(xp, T: int, imbalance, work_error, size):
     return T * xp.where(undecided, xp.maximum(2.0, xp.ceil(xp.abs(excess) ** (1 / 6))), 1.0)
 
 
-def _amplitude(xp, q, on_path):
+def _largest_excursion(xp, q, on_path):
     """The largest change of a coordinate along the path; infinite where nothing moves beyond rounding."""
     high = xp.max(xp.where(on_path[..., None], q, -math.inf), axis=-2)
     low = xp.min(xp.where(on_path[..., None], q, math.inf), axis=-2)
@@ -464,7 +464,7 @@ def _amplitude(xp, q, on_path):
     return xp.where(largest > rounding, largest, math.inf)
 
 
-def _limits(path: SampledPath, here: Measurements, on_path) -> tuple[Any, Any]:
+def _drift_limits(path: SampledPath, here: Measurements, on_path) -> tuple[Any, Any]:
     """The largest drift of h and the momenta by errors of steps and round-off, and their sizes, (…, k) each."""
     # Fixed steps have no tolerances: there `VISIBLE` of the size is the limit.
     xp, n = path.library, path.q.shape[-1]
