@@ -43,7 +43,7 @@ def derived(monkeypatch):
         made.append(key)
         return real(key, unhashable)
 
-    monkeypatch.setattr(_derivation, "_derived", counted)
+    monkeypatch.setattr(_derivation, "_derive_structure", counted)
     monkeypatch.setattr(_derivation, "_derived_once", functools.lru_cache(maxsize=64)(counted))
     return made
 

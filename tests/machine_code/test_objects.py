@@ -37,7 +37,7 @@ def run() -> np.ndarray:
 def made(monkeypatch):
     """The texts that LLVM is asked to make objects of."""
     texts, make = [], _ir._compile_object
-    monkeypatch.setattr(_ir, "_object", lambda text, level: texts.append(text) or make(text, level))
+    monkeypatch.setattr(_ir, "_compile_object", lambda text, level: texts.append(text) or make(text, level))
     return texts
 
 
