@@ -123,7 +123,7 @@ def _held_coordinates(scene: SceneState, hold: Any) -> np.ndarray:
     if not (hold is None or np.iterable(hold)):
         raise TypeError(f"hold is a name, such as 'qdot[0]', or a tuple of names; got {hold!r}.")
     for wanted in (hold,) if isinstance(hold, str) else hold or ():
-        named = np.array([[_contains_number(name, wanted) for name in of] for of in both])
+        named = np.array([[_names_number(name, wanted) for name in of] for of in both])
         if not named.any():
             raise ValueError(f"hold names {wanted!r}, and the numbers are {', '.join(sum(both, ())[:24])}.")
         chosen |= named
@@ -142,8 +142,8 @@ def _held_unknowns(scene: SceneState, chosen: np.ndarray, cyclic: np.ndarray, mo
     return np.where(cyclic, chosen[1], chosen[0])
 
 
-def _contains_number(name: str, wanted: Any) -> bool:
-    """True if a number is the one that is wanted, or one of an array or a pytree that is."""
+def _names_number(name: str, wanted: Any) -> bool:
+    """True if `wanted` names this number, or an array or a pytree that contains it."""
     return name == wanted or (isinstance(wanted, str) and name.startswith((f"{wanted}[", f"{wanted}.")))
 
 

@@ -208,7 +208,7 @@ class _SymmetryColumns(NamedTuple):
 
 
 def _measure_columns(scene: SceneState, fields: Fields, states: FlatState) -> _SymmetryColumns:
-    """The columns where they are finite, and their noise: how much they differ between states that hardly do."""
+    """The finite rows of the columns, and their noise: how much they differ between nearly equal states."""
     both = states, perturb_last_digits(states)
     here, beside = (
         _select_finite_rows(*map(np.asarray, _symmetry_columns(fields, at, *scene.arguments))) for at in both

@@ -39,12 +39,14 @@ BYTES_OF_ENTRY = 20
 
 # ---- sparse arrays ---------------------------------------------------------------------------------------------------
 
-# Coordinates from which patterns of zeros are looked for, and the number of scalar operations of L from which such a
-# scene runs on arrays: a ring of 1000 (11 000 operations) takes 3.5 s to a first result by machine code, 2 s by arrays,
-# whose time hardly grows; a batch of 256 rings of 300 is 30 times faster in machine code. With constraints coordinates
-# count: 100 rods (200) take machine code 4 s and 500 more than 240, arrays 8 s either way.
+# Coordinates from which patterns of zeros are looked for: below, machine code has a first result as soon as arrays.
 LEAST_COORDINATES = 100
-LEAST_OPERATIONS, LEAST_LINKED = 6000, 300
+# Scalar operations of L from which such a scene runs on arrays: a ring of 1000 (11 000) takes 3.5 s to a first result by
+# machine code, 2 s by arrays, whose time hardly grows; a batch of 256 rings of 300 is 30 times faster in machine code.
+LEAST_OPERATIONS = 6000
+# Coordinates from which it does with constraints: 100 rods (200 coordinates) take machine code 4 s, 500 rods more than
+# 240 s, arrays 8 s either way.
+LEAST_LINKED = 300
 # Coordinates up to which a dense M is a matrix: elimination takes 1 ms there, and conjugate gradients seldom less.
 LARGEST_DENSE = 512
 # Operations of L up to which machine code takes a large scene that is asked of it, or has borders: a ring of 4000, with

@@ -234,7 +234,7 @@ def count_operations(jaxpr) -> int:
 
 
 def _count_matrix_products(jaxpr) -> int:
-    """The products of two numbers in products of matrices, and the numbers that running sums and transforms read."""
+    """The count of scalar products in matrix products, and of numbers read by running sums and transforms."""
     count = sum(map(_count_matrix_products, core.subjaxprs(jaxpr)))
     for equation in jaxpr.eqns:
         if equation.primitive.name == "dot_general":

@@ -186,7 +186,7 @@ def _nan_unless(reached, x, *_, marks, batch, library: Any = jnp):
 
 
 def _nan_unless_transpose(cotangent, reached, x, *inputs, marks, batch):
-    """Of what is linear in x and in some of the inputs, with this many axes of a `batch` in front."""
+    """The transpose in x and in those inputs that it is linear in; the first axes of arrays are a `batch`."""
     cotangent = ad.instantiate_zeros(cotangent)
     kept = reached | (cotangent == 0)
     all_kept = kept.all(tuple(range(batch, kept.ndim)))

@@ -216,7 +216,7 @@ def _product(dimension_numbers, **_):
 
 
 def _map_members(rule: Callable) -> Callable:
-    """A rule of one member for all of them."""
+    """The rule of an operation for all members, made of its rule for one member."""
 
     def rule_of_all(*xs):
         rows = share_rows(*xs)

@@ -138,7 +138,7 @@ def _round_members(count, members: int) -> list[tuple]:
 
 
 def _pick(arrays, some, i=slice(None)) -> list:
-    """Of some members, unless all share the one row, what belongs to round i."""
+    """The rows of some members, at round i where it is a number; the one row where all members share it."""
     return [x[some, i] if len(x) > 1 else x[:, i] for x in arrays] if isinstance(i, int) else [
         x[some] if len(x) > 1 else x for x in arrays
     ]  # fmt: skip
@@ -149,7 +149,7 @@ def _split_halves(arrays) -> list[list]:
 
 
 def _split(arrays, *sizes: int) -> list[list]:
-    """Lists of the first arrays, of these `sizes`, and the rest."""
+    """The arrays in consecutive lists of these `sizes`, and a list of the rest."""
     ends = [0, *itertools.accumulate(sizes), len(arrays)]
     return [list(arrays[a:b]) for a, b in itertools.pairwise(ends)]
 
@@ -340,7 +340,7 @@ def _pull_back(given, of: Repetition, axes):
 
 
 def _pull_turn(given, of: Repetition, axes):
-    """It is symmetric in dx; and J(x)ᵀ dw is transposed to J(x)."""
+    """The transpose of `turn`: it is symmetric in dx, and the transpose of J(x)ᵀ dw is J(x)."""
     size = of.inputs + of.carried
     known, cts, moved = _split(given, size + of.fixed + of.rows + 1, of.results)
     still = list(map(jnp.zeros_like, cts))

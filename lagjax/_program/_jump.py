@@ -257,7 +257,7 @@ class _Jets:
 
 
 class _JumpBuilder:
-    """The jump in one graph, in which numbers are jets."""
+    """Builds the jump of state and tangents across a border in one graph, whose numbers are jets."""
 
     def __init__(self, borders: Borders, size: int, directions: tuple[int, ...], member: int, over_steps: bool):
         program = borders.program

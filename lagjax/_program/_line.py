@@ -138,7 +138,7 @@ class StraightLine:
 
 
 def _cut(x, part: slice) -> Any:
-    """The numbers of some states; one that is shared by all states stays."""
+    """The entries of some states; a number that all states share is returned as it is."""
     return x if x is None or np.size(x) == 1 else x[part]
 
 

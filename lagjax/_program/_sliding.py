@@ -91,7 +91,7 @@ def with_sliding(
 
 
 def _solved_system(z: Sequence[int]) -> LinearSystem:
-    """The system z = z, on whose right side pieces act that act on more than the right side of another one."""
+    """The linear system 1 z = z, for pieces that act on more than the right side of the scene's own system."""
     inputs = tuple(("input", (), i) for i in range(len(z)))
     same = StraightLine(inputs, ("float",) * len(z), tuple(range(len(z))))
     return LinearSystem(tuple(z), {}, tuple(z), (), lambda: same)

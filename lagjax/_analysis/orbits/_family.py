@@ -290,7 +290,7 @@ _ALONG = 0.7  # the cosine of the turn of a tangent between two neighbours, more
 
 
 def _family_tangent(follower: Follower, member: _Member, across: FamilyTangent) -> FamilyUnknowns:
-    """The change of all numbers along the family by the arc across a tangent."""
+    """The tangent of the family at an orbit, of unit length along the tangent `across`."""
     vector = member.tangent.vector / (member.tangent.vector @ across.vector)
     return follower.complete_change(member.point, vector, 0.0)
 

@@ -240,7 +240,7 @@ def close(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray
 
 
 def _damped_newton_step(closing: Closing, chain: Chain) -> Chain:
-    """Each chain after the largest share of one step by which its defect falls."""
+    """Each chain after the largest fraction of a Newton step that lowers its defect."""
     dy, dperiod = correction(closing, chain)
     longest = np.minimum(1.0, 0.25 * chain.period / np.maximum(np.abs(dperiod), 1e-300))
     best, waiting = chain, np.arange(len(chain.period))
@@ -279,7 +279,7 @@ def symmetries(chain: Chain, most: int | None = None) -> list[Symmetries]:
 
 
 def _closure_null_vectors(growth: np.ndarray) -> tuple[Decided, np.ndarray]:
-    """The decision about A + B of chains that are closed, and the right vectors at all states, (B, K, 2n, 2n)."""
+    """The rank of A + B of closed chains, and the right singular vectors at all states, (B, K, 2n, 2n)."""
     chains, count, states, _ = growth.shape
     condensed = condense(growth, np.zeros((chains, count, states, 0)))
     rank = decide(condensed.first + condensed.last, RANK)

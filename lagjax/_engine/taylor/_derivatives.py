@@ -93,7 +93,7 @@ def start_outputs(ts, dy0, path_dot, library: Any = np):
 
 
 def _direction_group_count(members: int, m: int) -> int:
-    """Into how many rows the m directions of each member go: those of a few members on all threads."""
+    """The number of rows over which the m directions of each member are spread: enough of few members for all threads."""
     lanes = _native.lanes()
     return max(1, min(_native.cores() // members, math.ceil(m / lanes))) if members < lanes else 1
 
@@ -263,7 +263,7 @@ def _projection_line(differentiate: Callable, program: Program, t: int) -> Line:
 def _differentiate_steps(
     flow: Flow, motions: Motions, tolerances: Tolerances, go: Callable, probe: Callable
 ) -> Iterator[int]:
-    """Let `go(steps)` take a derivative over the steps of all rows; rows that no steps suit are given.
+    """Call `go(steps)`, which differentiates over steps, for all rows; yield the rows without suitable steps.
 
     `go` and `probe` return how large the last terms of the series are, (R,), in units of the limit. `go` may bound that
     from above; where `probe` is larger than 1, the steps are divided until they suit.

@@ -306,7 +306,7 @@ def _vary_curvature(primals, tangents, _, **settings):
 
 
 def _curvature_transpose(cotangents, *args, **settings):
-    """It is linear in its cotangents, too: the transpose in those is the second derivative along two directions."""
+    """The transpose of `curvature`, linear in its cotangents: the second derivative along two directions."""
     moving, given, cts, direction = map(ad.instantiate_zeros, cotangents), args[:3], args[3:5], args[5:]
     if any(map(ad.is_undefined_primal, direction)):
         second = curvature_p.bind(*given, *cts, *moving, **settings)

@@ -85,7 +85,7 @@ class Adjoint:
             lane["params_ct", i] = 0.0
 
     def _advance_step(self, frame: Frame, lane: Lane, index: Value) -> None:
-        """One step less to go back; after the first one, write down the cotangents and take the next member."""
+        """Move the lane to the step before; after the first step, store the cotangents and load the next member."""
         code, member = frame.code, lane["member"]
         left = lane["step"] - 1
         lane["step"] = left

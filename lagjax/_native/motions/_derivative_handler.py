@@ -128,7 +128,7 @@ class _DerivativeCode(PlanCode):
         return well.value > 0
 
     def _sort_steps(self) -> None:
-        """The rows of the steps, member by member."""
+        """Sort the rows of the steps by member."""
         code, place, width = self.code, self.at, self.known["states"] + RECORDED
         first = code.variable(code.as_value(0, INTEGER))
         with code.loop(self.known["members"]) as i:

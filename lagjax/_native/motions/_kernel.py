@@ -402,7 +402,7 @@ def _collect_results(path, y_end, t_end, code, steps, rejected, changes, idle: i
 
 
 def _sort_by_member(table: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rows of the members that all `steps` (N,) are there of, one member after the other; and which these are.
+    """The rows of members with all their `steps` (N,), sorted by member, and the indices of these members.
 
     A step that was undone was written down more than once: the last time counts.
     """

@@ -98,7 +98,7 @@ class Tangent:
                     lane["next_begin"] = frame.read("record", self.replay.row(frame, lane) + self.replay.size)
 
     def _advance_step(self, frame: Frame, lane: Lane, index: Value) -> None:
-        """Write down how large the last terms were, and go one step on; after the last one take the next member."""
+        """Store the size of the last terms and begin the next step; after the last step, load the next member."""
         code, member, tangents = frame.code, lane["member"], self.directions.lanes_of_tangents(frame, index)
         largest = functools.reduce(code.maximum, [of_lane["excess"] for of_lane in tangents])
         frame.write("record", self.replay.row(frame, lane) + NUMBER, largest)

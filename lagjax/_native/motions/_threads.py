@@ -70,7 +70,7 @@ def run_on_threads(work: Callable[[Callable[[], bool]], int], count: int) -> int
 
 
 def _wait_for_helpers(helpers: int, ended: list, signal: queue.SimpleQueue, stop: threading.Event) -> None:
-    """Until all helpers have ended. An interrupt meanwhile stops them, and is raised when they have."""
+    """Wait until all helpers have ended. An interrupt stops the helpers, and is raised when they have ended."""
     interrupt = None
     while len(ended) < helpers:
         try:

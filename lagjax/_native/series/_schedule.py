@@ -179,7 +179,7 @@ def _frequent_pairs(pairs: Counter, kinds: _Kinds) -> dict[int, tuple[int, int, 
 
 
 def _insert_part(kind: OperationKind, place: int, part: OperationKind) -> OperationKind:
-    """The kind whose operand at this place, counted over all that it reads, is made by another."""
+    """The kind in which the operand at this place is replaced by the operation that computes it."""
     parts = list(kind.parts)
     for k, inner in enumerate(parts):
         width = 1 if inner is None else inner.operands

@@ -233,7 +233,7 @@ class BorderControl:
                 frame["more"] = frame["more"] + code.flag(at_once)
 
     def _refine_early_root(self, frame: Frame, degree: Value) -> None:
-        """A root that comes early is as exact as what lies before it allows, and not the whole step."""
+        """Refine a root early in the step: its error is that of the part before it, not of the whole step."""
         code = frame.code
 
         def early():

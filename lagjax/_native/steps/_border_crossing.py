@@ -121,7 +121,7 @@ class BorderCrossing:
             self._redecide_dependents(frame, going)
 
     def _release_borders(self, frame: Frame, where: Value, pieces: Container[int]) -> None:
-        """The motion touches the borders of some pieces no more, and slides along none of them."""
+        """Record that the motion neither touches the borders of some pieces nor slides along them."""
         for g, guard in enumerate(self.borders.guards):
             if guard.piece in pieces:
                 frame.assign(where, g, touch=Touch.NONE)

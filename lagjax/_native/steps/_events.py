@@ -325,7 +325,7 @@ class Events:
         self._limit_sight(frame, searching(), frame["begin"] * frame["part"])
 
     def _limit_sight(self, frame: Frame, where: Value, seen: Value) -> None:
-        """Note, in some lanes, that a guard is seen only up to a fraction of the step."""
+        """Store, in some lanes, the fraction of the step up to which the polynomial of a guard can be trusted."""
         frame.assign(where & (seen < frame["seen"]), seen=seen)
 
     def _ends_at_border(self, watch: Watch) -> Value:

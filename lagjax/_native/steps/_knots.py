@@ -60,7 +60,7 @@ class Knots:
         frame.assign(sooner, nearest=left / size, crossed=Crossed.KNOT, crossed_number=float(c))
 
     def _note_coincidence(self, frame: Frame, h: Value) -> None:
-        """Entries of several tables at one instant, one of which may be moved."""
+        """Mark entries of several tables at one instant, where one of them can depend on parameters."""
         code, end = frame.code, frame["nearest"] * abs(h)
         count, moves = frame.constant(0.0), frame.constant(0.0)
         for j in self.borders.clocks:

@@ -145,7 +145,7 @@ class Saltation:
         return {"edge": self.motion.states, "edge_t": 1, "edge_grazes": 1}
 
     def _note_edge(self, frame: Frame) -> None:
-        """The state at the end of a step, and what is to be known of the border there."""
+        """Store the state at the end of a step, and the data of the border that it lies on."""
         motion, code = self.motion, frame.code
         self.table.note_hit(frame, frame.constant(0.0) <= 0.0)
         moved = motion.move_state(frame, motion.increments(frame, frame.job("order"), frame["h"])[0])

@@ -50,7 +50,7 @@ def null_velocities(matrix: np.ndarray) -> np.ndarray:
 
 
 def _rounding_fraction(matrix: np.ndarray) -> float:
-    """The part of the largest eigenvalue that rounding may make of a zero: 32 units for each row."""
+    """The largest eigenvalue that rounding makes of a zero, as a fraction of the largest: 32 units for each row."""
     return 32 * singular_threshold(len(matrix), matrix.dtype)
 
 
