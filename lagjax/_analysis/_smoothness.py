@@ -66,12 +66,8 @@ def _function_borders(derivation: Derivation) -> list[tuple[str, str, int]]:
     return pieces_of_motion(derivation.motion, *derivation.state_shapes)
 
 
-def _shifted_state(scene: SceneState) -> tuple:
-    return scene.q, scene.qdot, jnp.zeros((), scene.q.dtype), scene.numbers
-
-
 def _measure_roughness(scene: SceneState) -> _Roughness:
-    q, v, t, numbers = jax.lax.stop_gradient(_shifted_state(scene))
+    q, v, t, numbers = jax.lax.stop_gradient((scene.q, scene.qdot, jnp.zeros((), scene.q.dtype), scene.numbers))
     n, eps = len(q), jnp.finfo(q.dtype).eps
 
     def sides(y):

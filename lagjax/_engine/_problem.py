@@ -469,12 +469,12 @@ def too_tight(rtol, dtype, least: float) -> str | None:
 def _checked_event(event) -> Event | None:
     """The event with its functions' signatures checked."""
     if isinstance(event, types.FunctionType):
-        return _reuse_event(Edition.from_function(event))
+        return _cached_event(Edition.from_function(event))
     return None if event is None else _make_event(event)
 
 
 @functools.lru_cache(maxsize=64)  # a signature takes as long to read as a short motion
-def _reuse_event(event: Edition) -> Event:
+def _cached_event(event: Edition) -> Event:
     return _make_event(event.function)
 
 

@@ -50,7 +50,11 @@ def what_stopped(acceleration: Callable, at: End, shrank, spent) -> tuple[jax.Ar
     those whose budget of steps is spent; others are not looked at.
     """
     on_host = isinstance(at.y, np.ndarray)
-    library, loop, evaluate_each = (np, _loop_in_python, map) if on_host else (jnp, jax.lax.while_loop, _map_compiled)
+    library, loop, evaluate_each = (
+        (np, _loop_in_python, map)
+        if on_host
+        else (jnp, jax.lax.while_loop, lambda f, xs: jax.lax.map(f, jnp.stack(xs)))
+    )
     n = at.y.shape[-1] // 2
     smallest = 4 * np.finfo(at.y.dtype).eps * library.maximum(abs(at.begin), abs(at.end))
     forward = library.where(at.end > at.begin, 1.0, -1.0) * smallest
@@ -96,10 +100,6 @@ def _jump_window(library, at: End, smallest, shrank):
     fighting = at.rejected > FIGHTING * (at.accepted + at.rejected)
     wide = mean * library.where(fighting, FAR, NEAR)
     return library.where(shrank, NARROW * smallest, library.maximum(wide, NARROW * smallest))
-
-
-def _map_compiled(function: Callable, arguments: list) -> jax.Array:
-    return jax.lax.map(function, jnp.stack(arguments))
 
 
 def _loop_in_python(goes_on: Callable, body: Callable, carry):

@@ -176,10 +176,6 @@ def _split(axis: int, sizes, **_):
     return lambda x: np.split(x, ends, axis=axis + 1)
 
 
-def _unstack(axis: int, **_):
-    return lambda x: list(np.moveaxis(x, axis + 1, 0))
-
-
 def _pad(begin: tuple, shape: tuple, config) -> Callable:
     """Of each axis, numbers go to `low` + j (`inner` + 1), as far as that lies within."""
     taken, placed = [slice(None)], [slice(None)]
@@ -329,7 +325,7 @@ _RULES: dict[str, Callable] = {
     "scatter_add": _scatter_add,
     "slice": _slice,
     "split": _split,
-    "unstack": _unstack,
+    "unstack": lambda axis, **_: lambda x: list(np.moveaxis(x, axis + 1, 0)),
     "dot_general": _product,
     "concatenate": lambda dimension, **_: _join(dimension, np.concatenate),
     "stack": lambda axis, **_: _join(axis, np.stack),

@@ -182,17 +182,9 @@ def _member_rows(x, batch: tuple, places: list, shape: tuple):
     return np.broadcast_to(x.reshape((*wide, *shape)), (*batch, *shape)).reshape((math.prod(batch), *shape))
 
 
-def _evaluate_value(of, x, first, still, rows, count, _):
-    return of.run(x, first, still, rows, count)
-
-
 def _evaluate_forward(of, x, first, still, rows, count, along):
     dx, dfirst = _split(along, of.inputs)
     return _later_halves(of.tangent.run([*x, *dx], [*first, *dfirst], still, rows, count), of.tangent)
-
-
-def _evaluate_back(of, x, first, still, rows, count, cotangents):
-    return of.go_back(x, first, still, rows, count, cotangents)
 
 
 def _evaluate_turn(of, x, first, still, rows, count, along):
@@ -351,7 +343,7 @@ def _pull_turn(given, of: Repetition, axes):
     return [*of_x, *_pull_back([*known, *moved], of, narrow)]
 
 
-value_p = _RepeatedMap("value", _shapes, _evaluate_value, _vary_value)
+value_p = _RepeatedMap("value", _shapes, lambda of, *x: of.run(*x[:-1]), _vary_value)
 forward_p = _RepeatedMap("forward", _shapes, _evaluate_forward, _vary_forward, _pull_forward)
-back_p = _RepeatedMap("back", _back_shapes, _evaluate_back, _vary_back, _pull_back)
+back_p = _RepeatedMap("back", _back_shapes, lambda of, *x: of.go_back(*x), _vary_back, _pull_back)
 turn_p = _RepeatedMap("turn", _back_shapes, _evaluate_turn, _vary_turn, _pull_turn)

@@ -85,7 +85,9 @@ def lift_problem(problem: Problem) -> Problem:
     system = replace_functions(problem.system, functions)
     event = problem.event
     if event is not None:
-        event = event._replace(conditions=jax.tree.map(lift, event.conditions, is_leaf=_is_function))
+        event = event._replace(
+            conditions=jax.tree.map(lift, event.conditions, is_leaf=lambda x: isinstance(x, Function))
+        )
     return dataclasses.replace(problem, system=system, event=event, params=Lifted(problem.params, tuple(values)))
 
 
@@ -96,10 +98,6 @@ def lift_batch(batch: Batch) -> Batch:
         return batch
     values = member.params.values
     return Batch(member, batch.ts, batch.y0, Lifted(batch.params, values), (*batch.axes, *[None] * len(values)))
-
-
-def _is_function(x: Any) -> bool:
-    return isinstance(x, Function)
 
 
 def _lift_function(function: Function, roles: int, problem: Problem, values: list) -> Function:

@@ -114,7 +114,7 @@ class _SceneSource:
         lines = {
             "acceleration": (_settle(of.accelerations.program.complete.line), f"qddot[{n}]; NaN where M is singular"),
             "mass_matrix": (of.program("mass_matrix").line, f"M, {n} rows of {n}"),
-            "energy": (_energy_line(of).line, "p qdot - L, one number"),
+            "energy": (_energy_program(of).line, "p qdot - L, one number"),
         }
         if of.accelerations.projected is not None:
             says = f"q and qdot, {2 * n} numbers, after one Newton step to the constraints"
@@ -153,7 +153,7 @@ def _settle(line: StraightLine) -> StraightLine:
     return eliminate_dead_code(graph, [graph.apply("select", singular, x, graph.number(np.nan)) for x in values])
 
 
-def _energy_line(derivation: Derivation) -> Program:
+def _energy_program(derivation: Derivation) -> Program:
     parts, n = derivation.program("momentum", "lagrangian"), derivation.layout.size
 
     def energy(*scalars):

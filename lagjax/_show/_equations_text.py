@@ -56,7 +56,10 @@ class Equations:
         lines = [f"{of}; M is symmetric, and what is not listed is 0.", ""]
         lines += [f"{name} = {formula}" for name, formula in self.parts.items()]
         for title, formulas in self._matrix_tables().items():
-            lines += [f"{title}[{_entry_key(key)}] = {formula}" for key, formula in formulas.items()]
+            lines += [
+                f"{title}[{key if isinstance(key, str) else ', '.join(key)}] = {formula}"
+                for key, formula in formulas.items()
+            ]
         return "\n".join(lines)
 
     def _matrix_tables(self) -> dict[str, dict]:
@@ -66,10 +69,6 @@ class Equations:
 
     def _repr_latex_(self) -> str:
         return f"$$\n{self.latex}\n$$" if self.latex else self.note
-
-
-def _entry_key(key: str | tuple[str, str]) -> str:
-    return key if isinstance(key, str) else ", ".join(key)
 
 
 def write_equations(system: "System", layout: Layout, params: PyTree, inputs: PyTree) -> Equations:

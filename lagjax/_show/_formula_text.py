@@ -148,7 +148,7 @@ class FormulaWriter:
         of = self.formulas.atoms[atom]
         if of.kind == "input":
             name = self.names[of.position]
-            return name.place, *_symbol_rank(name.text)
+            return name.place, 0 if _MASSES.fullmatch(name.text) else 1, name.text
         inner = [self._factor_rank(a) for x in of.operands for product, _ in x for a, _ in product]
         largest = max((place[0] for place in inner), default=_PARAMETER)
         if atom in self.parts:
@@ -165,10 +165,6 @@ class FormulaWriter:
 
 
 _MASSES = re.compile(r"(m|M|J|I|mass|inertia)[_\d]*")
-
-
-def _symbol_rank(name: str) -> tuple[int, str]:
-    return (0 if _MASSES.fullmatch(name) else 1), name
 
 
 def _number_text(c: float) -> tuple[str, str]:

@@ -74,7 +74,7 @@ class Units(NamedTuple):
         return growth * state[..., None, :] / state[..., :, None]
 
 
-def _replace_zeros(x: np.ndarray) -> np.ndarray:
+def _positive_or_one(x: np.ndarray) -> np.ndarray:
     return np.where((x > 0) & np.isfinite(x), x, 1.0)
 
 
@@ -171,7 +171,7 @@ class Arcs:
         off the rates by default."""
         n = self.size
         mass = np.abs(self.sample(0.0, y0).quantities("mass_matrix")["mass_matrix"][:, np.arange(n), np.arange(n)])
-        root = _replace_zeros(np.sqrt(np.where(mass > 0, mass, mass.max(axis=1, initial=0.0)[:, None])))
+        root = _positive_or_one(np.sqrt(np.where(mass > 0, mass, mass.max(axis=1, initial=0.0)[:, None])))
         far, fast, bend = (np.abs(x * root).max(axis=1) for x in (*halves(y0), halves(self.rate(0.0, y0))[1]))
         with np.errstate(all="ignore"):
             if time is None:
@@ -180,11 +180,11 @@ class Arcs:
                 for row in np.flatnonzero(~((length > 0) & (rate > 0) & np.isfinite(length * rate))):
                     scales = Scales.from_quantities(self._evaluate, *halves(y0[row]))  # which takes a hundred forces
                     length[row], rate[row] = np.abs(scales.q * root[row]).max(), 1 / scales.t
-                rate = _replace_zeros(rate)
+                rate = _positive_or_one(rate)
             else:
                 rate = 2 * np.pi / time
                 length = np.maximum(far, fast / rate)
-        length = _replace_zeros(length)
+        length = _positive_or_one(length)
         of_q = length[:, None] / root
         return Units(np.concatenate([of_q, rate[:, None] * of_q], axis=1), 1 / rate, length)
 

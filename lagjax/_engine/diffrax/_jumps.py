@@ -44,12 +44,12 @@ def freeze(tree):
 def may_jump(motion: Motion, t, y, params) -> bool:
     """True if F or γ has operations in it that decide on something; those of an elimination leave q̈ smooth."""
     parts = [motion.force, *([motion.constraints.gamma] if motion.constrained else [])]
-    return any(_is_discrete(jax.make_jaxpr(part)(*halves(y), t, params).jaxpr) for part in parts)
+    return any(_makes_decisions(jax.make_jaxpr(part)(*halves(y), t, params).jaxpr) for part in parts)
 
 
-def _is_discrete(jaxpr) -> bool:
+def _makes_decisions(jaxpr) -> bool:
     decides = any(equation.primitive.name in _DECIDING for equation in jaxpr.eqns)
-    return decides or any(map(_is_discrete, core.subjaxprs(jaxpr)))
+    return decides or any(map(_makes_decisions, core.subjaxprs(jaxpr)))
 
 
 def crosses(field, varied, begin, end, params) -> jax.Array:

@@ -93,7 +93,7 @@ def start_outputs(ts, dy0, path_dot, library: Any = np):
 
 
 def _direction_group_count(members: int, m: int) -> int:
-    """The number of rows over which the m directions of each member are spread: enough of few members for all threads."""
+    """The number of rows that share the m directions of a member: of few members, one or more a thread."""
     lanes = _native.lanes()
     return max(1, min(_native.cores() // members, math.ceil(m / lanes))) if members < lanes else 1
 
