@@ -1,13 +1,13 @@
 """How often intervals of 95 % hold the truth, in each kind of scene that `fit` takes.
 
-    python -m benchmarks.coverage                            the ten kinds of issue and guide, some ten minutes
+    python -m benchmarks.coverage                            all kinds, some ten minutes
     python -m benchmarks.coverage --kinds contact clipped    some of them, which are not stored
     python -m benchmarks.coverage --draws 1000 --seed 1
 
-Every draw makes records by the scene itself, adds noise, and fits them from parameters that are 10 % off, without a word
-about what the sensor does. Each free number of a draw counts as an interval of its own, though those of one draw are
-not independent. Intervals of fits that are not `ok` do not count: how many these are stands beside. The standard error
-is binomial, √(0.95 · 0.05/intervals).
+Every draw makes records by the scene itself, adds noise, and fits them from parameters that are 10 % off, without a
+word about what the sensor does. Each free number of a draw counts as an interval of its own, though those of one draw
+are not independent. Intervals of fits that are not `ok` do not count: how many these are stands beside. The standard
+error is binomial, √(0.95 · 0.05/intervals).
 
 The record goes to `benchmarks/results/coverage.json`, with commit, versions and machine.
 """
@@ -31,17 +31,16 @@ LEVEL = 0.95
 
 
 class Draw(NamedTuple):
-    """Records of a scene with noise, its parameters, and what else `lagjax.fit` is told."""
+    """Records of a scene with noise, and its parameters."""
 
     scene: Any
     records: list[lagjax.Record]
     truth: dict[str, float]
-    options: dict[str, Any] = {}
 
 
-def exact_values(scene, record: lagjax.Record, truth: dict[str, float], **options) -> Any:
+def exact_values(scene, record: lagjax.Record, truth: dict[str, float]) -> Any:
     """What sensors show of the motion from the known start of a record, without noise."""
-    kept = lagjax.fit(scene, record, truth, free=False, **options)
+    kept = lagjax.fit(scene, record, truth, free=False)
     return jax.tree.map(np.add, kept.residuals[0], record.values)
 
 
@@ -64,7 +63,7 @@ PENDULUM = lagjax.System(
     lambda q, v, params: 0.5 * v**2 + params["w2"] * jnp.cos(q),
     dissipation=lambda q, v, params: 0.5 * params["c"] * v**2,
 )
-SWING = {"w2": 9.0, "c": 0.1}
+SWING, TIMES = {"w2": 9.0, "c": 0.1}, np.linspace(0.0, 12.0, 601)
 DUFFING = lagjax.System(
     lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2 - 0.25 * params["k3"] * q**4,
     forces=lambda q, v, params, inputs: params["gain"] * inputs - params["c"] * v,
@@ -108,7 +107,7 @@ FRICTION = {"k": 4.0, "kinetic": 0.6, "static": 1.2}
 # ---- draws -----------------------------------------------------------------------------------------------------------
 
 
-def draw_swing(rng, size: float, sensor: Callable, knows_start: bool = False, ts=np.linspace(0.0, 12.0, 601)) -> Draw:
+def draw_swing(rng, size: float, sensor: Callable, knows_start: bool = False, ts=TIMES) -> Draw:
     """A swing of about this size, from any phase of it, as a sensor shows it."""
     size, phase = size * rng.uniform(0.95, 1.05), rng.uniform(0, 2 * np.pi)
     start = size * np.cos(phase), 3 * size * np.sin(phase)
@@ -238,9 +237,9 @@ def count_held(name: str, draw: Callable[[Any], Draw], seeds: range) -> dict[str
     refused, begun = 0, time.process_time()
     for seed in seeds:
         rng = np.random.default_rng(seed)
-        scene, records, truth, options = draw(rng)
+        scene, records, truth = draw(rng)
         begin = {k: x * (1 + OFF * rng.choice([-1, 1])) for k, x in truth.items()}
-        fit = lagjax.fit(scene, records, begin, **{"transforms": lagjax.positive, **options})
+        fit = lagjax.fit(scene, records, begin, transforms=lagjax.positive)
         if not fit.ok:
             refused += 1
             continue
@@ -257,7 +256,7 @@ def count_held(name: str, draw: Callable[[Any], Draw], seeds: range) -> dict[str
 
 
 def main(argv=None) -> list[dict[str, Any]]:
-    """Count, print a row of each kind, and store them where all of the ten were counted."""
+    """Count, print a row of each kind, and store them where all kinds were counted."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     every = KINDS | SENSORS
     parser.add_argument("--kinds", nargs="+", choices=tuple(every), default=tuple(every), metavar="KIND")

@@ -503,6 +503,27 @@ def test_a_correlated_square_is_that_of_the_whole_matrix():
     np.testing.assert_allclose(_autocorrelation.correlated_square(rows, lags).sum(axis=0), expected, atol=1e-12)
 
 
+@pytest.mark.parametrize(("size", "turn"), [(0.9, 0.0), (0.9, 0.3), (0.7, 2.0)])
+def test_the_correlations_of_an_autoregression_are_those_of_the_closed_form(size, turn):
+    lags = np.arange(60)
+    # Box, Jenkins & Reinsel, Time Series Analysis (2008), eq. (3.2.23), of two complex roots; a power for a real one.
+    phase = np.arctan2((1 + size**2) * np.sin(turn), (1 - size**2) * np.cos(turn))
+    law = size**lags * (np.sin(turn * lags + phase) / np.sin(phase) if turn else 1.0)
+    found = _autocorrelation.autoregressive_lags(np.concatenate([law, np.zeros(40)]), 1000)
+    np.testing.assert_allclose(found[:60], law, atol=1e-10)
+
+
+def test_a_signal_is_called_as_the_function_that_observes_it():
+    def arc(q, qdot):
+        return 0.3 * q
+
+    ts = np.linspace(0.0, 3.0, 61)
+    record = lagjax.Record(ts, 0.3 * np.cos(2 * ts), start=(1.0, 0.0))
+    scene = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2)
+    assert set(lagjax.fit(scene, record, {"k": 3.9}, observe=arc).noise) == {"arc"}
+    assert set(lagjax.fit(scene, record, {"k": 3.9}, observe=lambda q, v: arc(q, v)).noise) == {"values"}
+
+
 # ---- what is wrong, in a sentence ------------------------------------------------------------------------------------
 
 
