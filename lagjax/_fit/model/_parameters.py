@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._fit.model._laws import without_laws
 from lagjax._fit.model._transforms import AbstractTransform, Unbounded
 from lagjax._interface import as_arrays, labelled_leaves, require_finite
 
@@ -419,10 +420,10 @@ class Unknowns(NamedTuple):
 
 
 def _broadcast_prefix(prefix: PyTree, tree, leaves: list, name: str) -> list:
-    whole = jax.tree.unflatten(tree, leaves)
+    whole = without_laws(jax.tree.unflatten(tree, leaves))
     try:
-        spread = jax.tree.broadcast(prefix, whole, is_leaf=lambda leaf: leaf is None)
-        return tree.flatten_up_to(spread)
+        spread = jax.tree.broadcast(without_laws(prefix), whole, is_leaf=lambda leaf: leaf is None)
+        return jax.tree.structure(whole).flatten_up_to(spread)
     except ValueError:
         raise ValueError(
             f"{name} must be one value for all parameters, or name every one of them as params0 does; got {prefix!r}. "
