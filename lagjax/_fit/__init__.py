@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._fit.model._assembly import GivenSystem, assemble_residuals, read_systems
-from lagjax._fit.model._laws import terms
+from lagjax._fit.model._law_parameters import terms
 from lagjax._fit.model._noise import AbstractNoise, Clipped, Gaussian, Quantised, StudentT
 from lagjax._fit.model._parameters import Parameters, per_record
 from lagjax._fit.model._records import Guess, Record, require_untraced

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._fit.model._laws import without_laws
+from lagjax._fit.model._law_parameters import plain_dicts
 from lagjax._fit.model._transforms import AbstractTransform, Unbounded
 from lagjax._interface import as_arrays, labelled_leaves, require_finite
 
@@ -420,9 +420,9 @@ class Unknowns(NamedTuple):
 
 
 def _broadcast_prefix(prefix: PyTree, tree, leaves: list, name: str) -> list:
-    whole = without_laws(jax.tree.unflatten(tree, leaves))
+    whole = plain_dicts(jax.tree.unflatten(tree, leaves))
     try:
-        spread = jax.tree.broadcast(without_laws(prefix), whole, is_leaf=lambda leaf: leaf is None)
+        spread = jax.tree.broadcast(plain_dicts(prefix), whole, is_leaf=lambda leaf: leaf is None)
         return jax.tree.structure(whole).flatten_up_to(spread)
     except ValueError:
         raise ValueError(

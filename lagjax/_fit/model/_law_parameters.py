@@ -80,11 +80,11 @@ def find_laws(params: PyTree) -> list[FoundLaw]:
     return [FoundLaw("params" + jax.tree_util.keystr(path), leaf) for path, leaf in leaves if _is_law(leaf)]
 
 
-def without_laws(params: PyTree) -> PyTree:
+def plain_dicts(params: PyTree) -> PyTree:
     """The same pytree with plain dicts in place of the parameters of laws, its leaves in the same order."""
 
     def replace_law(branch):
-        return {name: without_laws(value) for name, value in branch.items()} if _is_law(branch) else branch
+        return {name: plain_dicts(value) for name, value in branch.items()} if _is_law(branch) else branch
 
     return jax.tree.map(replace_law, params, is_leaf=lambda leaf: _is_law(leaf) or leaf is None)
 
