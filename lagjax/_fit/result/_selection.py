@@ -1,0 +1,342 @@
+"""Selection: the candidate terms of a law that evidence asks for, by fits of the motion.
+
+The law is fitted with all of its terms. Then the term that is missed least leaves, the others are fitted anew from
+where the linear model puts them, and so forth: a path of nested fits. How much a term is missed is Wald's statistic
+with the covariance that allows for correlated residuals. Of many terms, those that together are missed no more than
+chance has it leave at once. Evidence is
+
+    BIC = k log(n/λ) − 2 log L/λ
+
+with k free numbers, and λ the mean factor by which correlated residuals widen the variances of all terms: n samples
+tell as much as n/λ independent ones.
+
+BIC finds the law among laws of which one is true. Where residuals are correlated none is, and with many samples every
+term improves the fit of the records by something that the law is not about. Then records that are left out decide, if
+there are at least three: the smallest law that follows them as well as the best does, within one standard error.
+
+A path of nested fits may lose the better of two terms that are alike. So each term that left is put in the place of
+each that is kept, from the smallest fit that had it, where the linear model says that this may do as well.
+
+Others take many terms out by shrinking (Tibshirani's lasso, sequential thresholds of Brunton, Proctor & Kutz): that
+biases what is kept, and a threshold has units. Source: Miller, *Subset Selection in Regression* (2002); Kent,
+Biometrika 69 (1982) 19, for λ; Kass & Raftery, J. Am. Stat. Assoc. 90 (1995) 773, for what a difference of BIC means.
+"""
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._equations import decide
+from lagjax._fit.model._law_parameters import FoundLaw
+from lagjax._fit.model._noise import AbstractNoise
+from lagjax._fit.model._parameters import Parameters
+from lagjax._fit.model._residuals import LostMotion, Point
+from lagjax._fit.result._comparison import choose_simplest, cross_validate
+from lagjax._fit.result._information import Information, information
+from lagjax._fit.search._descent import Descent, column_norms, eliminate, minimise
+
+_ENOUGH, _TRIALS = 1e-3, 60  # of the fit that is taken, as of the search
+_ENOUGH_OF_STEP, _TRIALS_OF_STEP = 1e-2, 20  # of the other fits, whose BIC is then known to 0.02
+_DECIDED = 6.0  # of BIC: odds of 20 to 1, as those of an interval of 95 %
+_CORRELATED = 0.5  # of neighbouring residuals: beyond, the scene lacks something, and records left out decide
+_FEWEST_RECORDS = 3  # of which one can be left out
+_FOLDS = 4  # groups of records, at most, that are left out in turn: each fit has three quarters of them
+_TRIED_SWAPS = 6  # of the likeliest
+_TRIED_TOGETHER = 6  # terms up to which one leaves at a time
+_KEPT = 1e6  # over the norm of a column: the weight that holds an unknown in a linear model
+_ALONE = 1e-3  # of a null direction: the part of it in other unknowns, or in a term, that counts as none
+
+
+class SelectionStep(NamedTuple):
+    """One fit of a selection: the terms it has, those that it lacks of the fit before, its BIC, and the geometric mean
+    over records of RMS residuals where they were left out, None where none was."""
+
+    terms: tuple[str, ...]
+    dropped: tuple[str, ...]
+    bic: float
+    left_out: float | None
+
+
+class Selection(NamedTuple):
+    """The choice of terms by a fit. Print it for a table with a line for each step.
+
+    - `kept`: the names of the terms that are kept; `steps`: the fits that were compared, from all terms to few.
+    - `alike`: sentences for the terms that the data cannot tell apart.
+    """
+
+    kept: tuple[str, ...]
+    steps: tuple[SelectionStep, ...]
+    alike: tuple[str, ...]
+    text: str
+
+    def __repr__(self) -> str:
+        return self.text
+
+
+def select_terms(
+    done: Descent, law: AbstractNoise, laws: list[FoundLaw], tell: Callable[[str], None] | None
+) -> tuple[Descent, Selection]:
+    """The fit with the terms that evidence asks for, from that with all of them; `tell` prints a line for each fit."""
+    search = _PathSearch.from_fit(done, law, _label_terms(laws), tell or (lambda _: None))
+    search.follow()
+    best, why = search.choose()
+    best, rivals = search.swap(best)
+    alike = [_alike_sentence(name, same) for name, same in search.same.items() if {*same} & {*best.columns}]
+    alike += [f"The data cannot tell {a!r} from {b!r}: either fits." for a, b in rivals]
+    kept, count = tuple(best.columns), len(search.names)
+    said = f"Of {count} terms {len(kept)} {'is' if len(kept) == 1 else 'are'} kept, {why}: {', '.join(kept) or 'none'}."
+    end = minimise(best.done.residuals, best.done.trial.point, law, _ENOUGH, _TRIALS)
+    if len(done.residuals.pieces) > len(done.residuals.records):
+        end = end._replace(message=done.message, converged=done.converged and end.converged)
+    end = end._replace(trials=done.trials + search.trials, message=" ".join([end.message, said, *alike]))
+    unused = [_alike_sentence(name, same) for name, same in search.same.items() if not same]
+    text = "\n".join([*search.rows(), said, *alike, *unused])
+    return end, Selection(kept, tuple(search.steps), tuple(alike), text)
+
+
+def _alike_sentence(name: str, same: list[str]) -> str:
+    if not same:
+        return f"Nothing that was measured depends on {name!r}."
+    others = repr(same[0]) if len(same) == 1 else f"a sum of {', '.join(map(repr, same))}"
+    return f"The data cannot tell {name!r} from {others}: either fits."
+
+
+def _label_terms(laws: list[FoundLaw]) -> dict[str, str]:
+    """The terms of all laws that select: the name of each by its label among parameters. They are called as in their
+    law, and where two laws have one of the same name by their whole label."""
+    labels = {f"{law.label}[{name!r}]": name for law in laws if law.law.selects for name in law.params}
+    called = list(labels.values())
+    return {label: label if called.count(name) > 1 else name for label, name in labels.items()}
+
+
+def _term_columns(names: dict[str, str], parameters: Parameters) -> dict[str, np.ndarray]:
+    """The unknowns that move each term of which a number is free, by its name."""
+    found: dict[str, np.ndarray] = {}
+    for own, _, part in parameters.cuts:
+        for label, name in names.items():
+            if part.label == label or part.label.startswith(f"{label}["):
+                found[name] = np.append(found.get(name, np.zeros(0, int)), np.arange(own.start, own.stop))
+    return {name: found[name] for name in names.values() if name in found}
+
+
+class _TermFit(NamedTuple):
+    """A fit with some of the terms: the unknowns of each, the steps (F,) that would make each of them zero, and the
+    information about them."""
+
+    done: Descent
+    columns: dict[str, np.ndarray]
+    zero: np.ndarray
+    known: Information
+
+    @classmethod
+    def from_descent(cls, done: Descent, names: dict[str, str]) -> "_TermFit":
+        parameters, u = done.residuals.parameters, done.trial.u
+        columns, slopes, values = _term_columns(names, parameters), parameters.jacobian(u), parameters.values(u)
+        zero = np.zeros(len(parameters))
+        for k in np.concatenate([np.zeros(0, int), *columns.values()]):
+            row = np.argmax(np.abs(slopes[:, k]))
+            zero[k] = -values[row] / slopes[row, k]
+        return cls(done, columns, zero, information(done))
+
+    @property
+    def log_likelihood(self) -> float:
+        return self.done.residuals.log_likelihood(self.done.trial, self.done.noise)
+
+    def places(self, names) -> np.ndarray:
+        """The unknowns of some terms."""
+        return np.concatenate([np.zeros(0, int), *(self.columns[name] for name in names)])
+
+    def widening(self, names) -> float:
+        """The mean factor by which correlated residuals widen the variances of some terms."""
+        own = self.places(names)
+        white, whole = (np.diag(matrix)[own] for matrix in (self.known.white, self.known.identifiable))
+        seen = white > 0
+        return max(float(np.mean(whole[seen] / white[seen])), 1.0) if seen.any() else 1.0
+
+    def loss(self, names) -> float:
+        """Twice the log likelihood that a linear model loses without some terms, as if residuals were white."""
+        own = self.places(names)
+        size = np.sqrt(np.diag(self.known.white)[own])
+        own, size = own[size > 0], size[size > 0]
+        zero = self.zero[own] / size
+        return float(zero @ np.linalg.solve(self.known.white[np.ix_(own, own)] / np.outer(size, size), zero))
+
+    def find_least(self) -> list[str]:
+        """The term that is missed least; of many those that together are missed no more than chance has it."""
+        missed = {name: self.loss([name]) / self.widening([name]) / len(own) for name, own in self.columns.items()}
+        order = sorted(missed, key=lambda name: missed[name])
+        found = order[:1]
+        for name in order[1 : len(order) // 2 if len(order) > _TRIED_TOGETHER else 1]:
+            more = [*found, name]
+            if self.loss(more) / self.widening(more) > len(self.places(more)):
+                break
+            found = more
+        return found
+
+    def find_same(self) -> dict[str, list[str]]:
+        """The terms that others do exactly as well, by the name of each that is superfluous, with these others; a term
+        that nothing depends on has none. Directions that also move other parameters say nothing about terms."""
+        residuals = self.done.residuals
+        triangles = residuals.linearise(self.done.trial, self.done.noise)
+        norms = column_norms(triangles, residuals.states, residuals.unknowns)[1]
+        null, alive, found = self.known.confirmed * norms[:, None], list(self.columns), {}
+        null = null / np.linalg.norm(null, axis=0)
+        while alive:
+            others = np.setdiff1d(np.arange(len(null)), self.places(alive))
+            inside = null @ decide(null[others], absolute=_ALONE).null
+            if not inside.shape[1]:
+                break
+            sizes = {name: np.abs(inside[self.columns[name], 0]).max() for name in alive}
+            same = [name for name, size in sizes.items() if size > _ALONE * max(sizes.values())]
+            alive.remove(same[-1])
+            found[same[-1]] = same[:-1]
+        return found
+
+    def drop(self, names, law: AbstractNoise) -> Descent | None:
+        """The fit without some terms, from where the linear model puts the others; None where none can be followed."""
+        residuals, trial = self.done.residuals, self.done.trial
+        parameters, stays = residuals.parameters, np.isin(np.arange(len(trial.u)), self.places(names))
+        triangles = residuals.linearise(trial, self.done.noise)
+        scale = column_norms(triangles, residuals.states, residuals.unknowns)
+        weight = _KEPT * np.where(stays, scale[1], 0.0)
+        pull = weight, -weight * self.zero
+        step = eliminate(triangles, residuals.states, scale, 1e-14, pull, residuals.unknowns)
+        u = parameters.take_step(trial.u, np.where(stays, 0.0, step.u))
+        smaller = parameters.fix(trial.u, stays)
+        first = smaller.first.copy()
+        first[np.setdiff1d(parameters.free_places, smaller.free_places)] = 0.0
+        residuals, begun = residuals.with_parameters(replace(smaller, first=first)), []
+        for point in (Point(u[~stays], trial.starts + step.starts), Point(trial.u[~stays], trial.starts)):
+            with contextlib.suppress(LostMotion):
+                there = residuals.evaluate(point)
+                begun.append((residuals.log_likelihood(there, residuals.noise_scale(there, law)), point))
+        if not begun:
+            return None
+        point = max(begun, key=lambda pair: pair[0])[1]
+        return minimise(residuals, point, law, _ENOUGH_OF_STEP, _TRIALS_OF_STEP)
+
+
+@dataclass(eq=False)
+class _PathSearch:
+    """The search of terms along a path of nested fits: `worth` is that of a sample in independent ones, `count` the
+    number of independent samples; `same` are terms that others do exactly as well."""
+
+    law: AbstractNoise
+    names: dict[str, str]
+    tell: Callable[[str], None]
+    path: list[_TermFit]
+    steps: list[SelectionStep]
+    same: dict[str, list[str]]
+    worth: float = 1.0
+    count: float = 1.0
+    trials: int = 0
+
+    @classmethod
+    def from_fit(cls, done: Descent, law: AbstractNoise, names: dict[str, str], tell: Callable) -> "_PathSearch":
+        """The search from a fit with all terms, less those that are superfluous at once."""
+        first = _TermFit.from_descent(done, names)
+        found = cls(law, names, tell, [], [], first.find_same())
+        if found.same and (smaller := found.drop(first, list(found.same))) is not None:
+            first = smaller
+        found.worth = 1.0 / first.widening(first.columns)
+        found.count = max(found.worth * done.residuals.measured, 2.0)
+        found.append(first, list(found.same))
+        return found
+
+    def drop(self, fit: _TermFit, names) -> _TermFit | None:
+        done = fit.drop(names, self.law)
+        if done is None:
+            return None
+        self.trials += done.trials
+        return _TermFit.from_descent(done, self.names)
+
+    def append(self, fit: _TermFit, dropped: list[str]) -> None:
+        self.path.append(fit)
+        self.steps.append(SelectionStep(tuple(fit.columns), tuple(dropped), self.bic(fit), None))
+        self.tell(f"terms: {', '.join(fit.columns) or 'none'}; BIC {self.steps[-1].bic:.1f}")
+
+    def bic(self, fit: _TermFit, loss: float = 0.0, dropped: int = 0) -> float:
+        """The BIC of a fit, or of one without some of its unknowns, by twice the log likelihood that this loses."""
+        free = len(fit.done.trial.u) - fit.known.null.shape[1] - dropped
+        return free * float(np.log(self.count)) - self.worth * (2 * fit.log_likelihood - loss)
+
+    def follow(self) -> None:
+        """Fits with fewer and fewer terms, as long as a smaller one may be better than the best."""
+        while self.path[-1].columns:
+            last = self.path[-1]
+            dropped = last.find_least()
+            smaller = self.drop(last, dropped)
+            if smaller is None:
+                break
+            self.append(smaller, dropped)
+            if -2 * self.worth * smaller.log_likelihood > min(step.bic for step in self.steps):
+                break
+
+    def choose(self) -> tuple[_TermFit, str]:
+        """The fit that is taken, and what it was chosen by."""
+        best = int(np.argmin([step.bic for step in self.steps]))
+        residuals = self.path[best].done.residuals
+        records = len(residuals.records)
+        correlated = np.nanmax(self.path[best].known.correlation) > _CORRELATED
+        if not correlated or records < _FEWEST_RECORDS or len(self.path) == 1:
+            return self.path[best], f"by BIC with {self.count:.0f} effective samples"
+        scores = []
+        for k, fit in enumerate(self.path):
+            done = fit.done
+            _, score = cross_validate(done.residuals, done.trial.point, done.noise, self.law, min(records, _FOLDS))
+            scores.append(score)
+            rms = float(np.exp(np.mean(score)))
+            self.steps[k] = self.steps[k]._replace(left_out=rms)
+            self.tell(f"terms: {', '.join(fit.columns) or 'none'}; RMS {rms:.4g} of records left out")
+        free = tuple(len(fit.done.trial.u) for fit in self.path)
+        return self.path[choose_simplest(free, np.array(scores))], "by records left out and simulated"
+
+    def swap(self, best: _TermFit) -> tuple[_TermFit, list[tuple[str, str]]]:
+        """The best fit with one term in the place of another, and the pairs (other, kept) of which either fits."""
+        tried: dict[frozenset, _TermFit] = {}
+        while True:
+            rivals = []
+            for _, wider, rest, pair in self._likely_swaps(best)[:_TRIED_SWAPS]:
+                key = frozenset(wider.columns) - frozenset(rest)
+                if key not in tried and (found := self.drop(wider, rest)) is not None:
+                    tried[key] = found
+                    self.tell(f"terms: {', '.join(found.columns)}; BIC {self.bic(found):.1f}")
+                if key in tried:
+                    rivals.append((self.bic(tried[key]), pair, tried[key]))
+            here = self.bic(best)
+            better = [rival for rival in rivals if rival[0] < here - 1e-3]
+            if not better:
+                return best, [pair for bic, pair, _ in rivals if bic < here + _DECIDED]
+            bic, (_, old), best = min(better, key=lambda rival: rival[0])
+            self.steps.append(SelectionStep(tuple(best.columns), (old,), bic, None))
+
+    def _likely_swaps(self, best: _TermFit) -> list[tuple[float, _TermFit, list[str], tuple[str, str]]]:
+        """What may do as well as the best fit with one term in the place of another, the likeliest first: its BIC in a
+        linear model, a wider fit, the terms that this is to lose, and the pair (new, old)."""
+        found, here = [], self.bic(best)
+        for new in (name for name in self.path[0].columns if name not in best.columns):
+            for old in best.columns:
+                wanted = {*best.columns, new} - {old}
+                wider = [fit for fit in self.path if wanted <= {*fit.columns}]
+                if not wider:
+                    continue
+                rest = [name for name in wider[-1].columns if name not in wanted]
+                bic = self.bic(wider[-1], wider[-1].loss(rest), len(wider[-1].places(rest)))
+                if bic < here + 2 * _DECIDED:
+                    found.append((bic, wider[-1], rest, (new, old)))
+        return sorted(found, key=lambda one: one[0])
+
+    def rows(self) -> list[str]:
+        """The lines of the table: a step each, with the terms that left, and what is left."""
+        left = any(step.left_out is not None for step in self.steps)
+        wide = max(len(", ".join(step.dropped)) for step in self.steps)
+        wide = max(wide, len("without"))
+        rows = [f"{'without':<{wide}}{'BIC':>12}{'RMS left out' if left else '':>{14 * left}}  terms"]
+        for step in self.steps:
+            rms = "" if step.left_out is None else f"{step.left_out:.4g}"
+            terms = ", ".join(step.terms) or "none"
+            rows.append(f"{', '.join(step.dropped):<{wide}}{step.bic:>12.1f}{rms:>{14 * left}}  {terms}")
+        return rows
