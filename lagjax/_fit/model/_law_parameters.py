@@ -112,11 +112,11 @@ class Terms(AbstractLaw):
 
     def __call__(self, *roles, params: Mapping[str, Any], **extras):
         """Σ params[name] · term(*roles), and of the extras what each term asks for by name."""
-        if not isinstance(params, Mapping) or (lacking := [name for name in self.terms if name not in params]):
-            got = f"{lacking[0]!r} is not in {list(params)}" if isinstance(params, Mapping) else f"got {params!r}"
+        if not isinstance(params, Mapping) or params.keys() != self.terms.keys():
+            got = f"numbers for {', '.join(map(repr, params))}" if isinstance(params, Mapping) else repr(params)
             raise TypeError(
-                f"params of {self!r} must have a number for each term; {got}. Give law(q, params=params['law']) the "
-                "branch of the parameters that begins as law.params0."
+                f"params of {self!r} must have a number for each term, and no other; got {got}. Call the law with the "
+                'branch of the parameters that begins as law.params0: law(q, params=params["law"]).'
             )
         if unasked := [key for key in extras if not any(self._asks(name, key) for name in self.terms)]:
             raise TypeError(f"No term of {self!r} asks for {unasked[0]!r}.")

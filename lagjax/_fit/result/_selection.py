@@ -23,6 +23,8 @@ Biometrika 69 (1982) 19, for λ; Kass & Raftery, J. Am. Stat. Assoc. 90 (1995) 7
 """
 
 import contextlib
+import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -33,9 +35,9 @@ from lagjax._equations import decide
 from lagjax._fit.model._law_parameters import FoundLaw
 from lagjax._fit.model._noise import AbstractNoise
 from lagjax._fit.model._parameters import Parameters
-from lagjax._fit.model._residuals import LostMotion, Point
+from lagjax._fit.model._residuals import LostMotion, Point, qr_triangle
 from lagjax._fit.result._comparison import choose_simplest, cross_validate
-from lagjax._fit.result._information import Information, information
+from lagjax._fit.result._information import Information, information, parameter_rows
 from lagjax._fit.search._descent import Descent, column_norms, eliminate, minimise
 
 _ENOUGH, _TRIALS = 1e-3, 60  # of the fit that is taken, as of the search
@@ -44,7 +46,9 @@ _DECIDED = 6.0  # of BIC: odds of 20 to 1, as those of an interval of 95 %
 _CORRELATED = 0.5  # of neighbouring residuals: beyond, the scene lacks something, and records left out decide
 _FEWEST_RECORDS = 3  # of which one can be left out
 _FOLDS = 4  # groups of records, at most, that are left out in turn: each fit has three quarters of them
-_TRIED_SWAPS = 6  # of the likeliest
+_TRIED_RIVALS = 6  # of the likeliest
+_MOST_SUBSETS = 5000  # of as many terms, all of which are looked at: milliseconds for three of thirty
+_ALIKE = 1e-3  # of BIC, that two ends of one search differ by
 _TRIED_TOGETHER = 6  # terms up to which one leaves at a time
 _KEPT = 1e6  # over the norm of a column: the weight that holds an unknown in a linear model
 _ALONE = 1e-3  # of a null direction: the part of it in other unknowns, or in a term, that counts as none
@@ -83,25 +87,36 @@ def select_terms(
     search = _PathSearch.from_fit(done, law, _label_terms(laws), tell or (lambda _: None))
     search.follow()
     best, why = search.choose()
-    best, rivals = search.swap(best)
-    alike = [_alike_sentence(name, same) for name, same in search.same.items() if {*same} & {*best.columns}]
-    alike += [f"The data cannot tell {a!r} from {b!r}: either fits." for a, b in rivals]
+    best, rivals = search.exchange(best)
+    kept = frozenset(best.columns)
+    alike = [_alike_sentence([name], same) for name, same in search.same.items() if same and kept.issuperset(same)]
+    alike += [_alike_sentence(one.columns.keys() - kept, kept - one.columns.keys()) for one in rivals]
     kept, count = tuple(best.columns), len(search.names)
     said = f"Of {count} terms {len(kept)} {'is' if len(kept) == 1 else 'are'} kept, {why}: {', '.join(kept) or 'none'}."
     end = minimise(best.done.residuals, best.done.trial.point, law, _ENOUGH, _TRIALS)
     if len(done.residuals.pieces) > len(done.residuals.records):
         end = end._replace(message=done.message, converged=done.converged and end.converged)
     end = end._replace(trials=done.trials + search.trials, message=" ".join([end.message, said, *alike]))
-    unused = [_alike_sentence(name, same) for name, same in search.same.items() if not same]
+    unused = [f"Nothing that was measured depends on {name!r}." for name, same in search.same.items() if not same]
     text = "\n".join([*search.rows(), said, *alike, *unused])
     return end, Selection(kept, tuple(search.steps), tuple(alike), text)
 
 
-def _alike_sentence(name: str, same: list[str]) -> str:
-    if not same:
-        return f"Nothing that was measured depends on {name!r}."
-    others = repr(same[0]) if len(same) == 1 else f"a sum of {', '.join(map(repr, same))}"
-    return f"The data cannot tell {name!r} from {others}: either fits."
+def _alike_sentence(others, kept) -> str:
+    a, b = (" with ".join(map(repr, sorted(names))) for names in (others, kept))
+    return f"The data cannot tell {a} from {b}: either fits."
+
+
+def _nested(a: "_TermFit", b: "_TermFit") -> bool:
+    """True if one of two fits has all terms of the other."""
+    return a.columns.keys() <= b.columns.keys() or b.columns.keys() <= a.columns.keys()
+
+
+def _project(columns: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """The part of a vector (M,) that lies in the span of some columns (M, K)."""
+    decided = decide(columns, _ALONE**2)
+    basis = decided.left[:, : int(decided.rank)]
+    return basis @ (basis.T @ target)
 
 
 def _label_terms(laws: list[FoundLaw]) -> dict[str, str]:
@@ -124,12 +139,14 @@ def _term_columns(names: dict[str, str], parameters: Parameters) -> dict[str, np
 
 class _TermFit(NamedTuple):
     """A fit with some of the terms: the unknowns of each, the steps (F,) that would make each of them zero, and the
-    information about them."""
+    information about them. `rows` (M, F) are those of the terms in the linear model, orthogonal to all other unknowns,
+    in units of the noise."""
 
     done: Descent
     columns: dict[str, np.ndarray]
     zero: np.ndarray
     known: Information
+    rows: np.ndarray
 
     @classmethod
     def from_descent(cls, done: Descent, names: dict[str, str]) -> "_TermFit":
@@ -139,7 +156,14 @@ class _TermFit(NamedTuple):
         for k in np.concatenate([np.zeros(0, int), *columns.values()]):
             row = np.argmax(np.abs(slopes[:, k]))
             zero[k] = -values[row] / slopes[row, k]
-        return cls(done, columns, zero, information(done))
+        own = np.concatenate([np.zeros(0, int), *columns.values()])
+        others = np.setdiff1d(np.arange(len(parameters)), own)
+        residuals = done.residuals
+        triangles = residuals.linearise(done.trial, done.noise)
+        whole = parameter_rows(triangles, residuals.states, residuals.unknowns)
+        rows = np.zeros((len(own), len(parameters)))
+        rows[:, own] = qr_triangle(whole[:, [*others, *own]])[len(others) :, len(others) :]
+        return cls(done, columns, zero, information(done), rows)
 
     @property
     def log_likelihood(self) -> float:
@@ -158,11 +182,17 @@ class _TermFit(NamedTuple):
 
     def loss(self, names) -> float:
         """Twice the log likelihood that a linear model loses without some terms, as if residuals were white."""
-        own = self.places(names)
-        size = np.sqrt(np.diag(self.known.white)[own])
-        own, size = own[size > 0], size[size > 0]
-        zero = self.zero[own] / size
-        return float(zero @ np.linalg.solve(self.known.white[np.ix_(own, own)] / np.outer(size, size), zero))
+        left = self.places(name for name in self.columns if name not in names)
+        target = self.rows @ self.zero
+        return float(np.sum((target - _project(self.rows[:, left], target)) ** 2))
+
+    def rank_terms(self) -> list[str]:
+        """The terms in the order in which they explain the most of what all together do, each with those before it."""
+        order, lost = [], list(self.columns)
+        while lost:
+            losses = [self.loss([other for other in lost if other != name]) for name in lost]
+            order.append(lost.pop(int(np.argmin(losses))))
+        return order
 
     def find_least(self) -> list[str]:
         """The term that is missed least; of many those that together are missed no more than chance has it."""
@@ -182,7 +212,7 @@ class _TermFit(NamedTuple):
         residuals = self.done.residuals
         triangles = residuals.linearise(self.done.trial, self.done.noise)
         norms = column_norms(triangles, residuals.states, residuals.unknowns)[1]
-        null, alive, found = self.known.confirmed * norms[:, None], list(self.columns), {}
+        null, alive, found = self.known.confirmed * norms[:, None], self.rank_terms(), {}
         null = null / np.linalg.norm(null, axis=0)
         while alive:
             others = np.setdiff1d(np.arange(len(null)), self.places(alive))
@@ -265,6 +295,7 @@ class _PathSearch:
 
     def follow(self) -> None:
         """Fits with fewer and fewer terms, as long as a smaller one may be better than the best."""
+        self._leap()
         while self.path[-1].columns:
             last = self.path[-1]
             dropped = last.find_least()
@@ -274,6 +305,20 @@ class _PathSearch:
             self.append(smaller, dropped)
             if -2 * self.worth * smaller.log_likelihood > min(step.bic for step in self.steps):
                 break
+
+    def _leap(self) -> None:
+        """The fit with the terms that explain the most, as many as the linear model of the first fit asks for; only
+        where it is better than that."""
+        first = self.path[-1]
+        order = first.rank_terms()
+        rests = [order[count:] for count in range(1, len(order) - 1)]
+        bics = [self.bic(first, first.loss(rest), len(first.places(rest))) for rest in rests]
+        if not bics or min(bics) > self.steps[-1].bic:
+            return
+        rest = rests[int(np.argmin(bics))]
+        smaller = self.drop(first, rest)
+        if smaller is not None and self.bic(smaller) < self.steps[-1].bic:
+            self.append(smaller, rest)
 
     def choose(self) -> tuple[_TermFit, str]:
         """The fit that is taken, and what it was chosen by."""
@@ -294,40 +339,40 @@ class _PathSearch:
         free = tuple(len(fit.done.trial.u) for fit in self.path)
         return self.path[choose_simplest(free, np.array(scores))], "by records left out and simulated"
 
-    def swap(self, best: _TermFit) -> tuple[_TermFit, list[tuple[str, str]]]:
-        """The best fit with one term in the place of another, and the pairs (other, kept) of which either fits."""
-        tried: dict[frozenset, _TermFit] = {}
+    def exchange(self, best: _TermFit) -> tuple[_TermFit, list[_TermFit]]:
+        """The best fit with other terms in the place of some, and those that fit as well, with no more terms."""
+        tried: dict[tuple[str, ...], _TermFit] = {}
         while True:
-            rivals = []
-            for _, wider, rest, pair in self._likely_swaps(best)[:_TRIED_SWAPS]:
-                key = frozenset(wider.columns) - frozenset(rest)
+            for _, wider, rest in self._likely_rivals(best)[:_TRIED_RIVALS]:
+                key = tuple(name for name in wider.columns if name not in rest)
                 if key not in tried and (found := self.drop(wider, rest)) is not None:
                     tried[key] = found
-                    self.tell(f"terms: {', '.join(found.columns)}; BIC {self.bic(found):.1f}")
-                if key in tried:
-                    rivals.append((self.bic(tried[key]), pair, tried[key]))
-            here = self.bic(best)
-            better = [rival for rival in rivals if rival[0] < here - 1e-3]
-            if not better:
-                return best, [pair for bic, pair, _ in rivals if bic < here + _DECIDED]
-            bic, (_, old), best = min(better, key=lambda rival: rival[0])
-            self.steps.append(SelectionStep(tuple(best.columns), (old,), bic, None))
+                    self.tell(f"terms: {', '.join(key)}; BIC {self.bic(found):.1f}")
+            here, rivals = self.bic(best), sorted(tried.values(), key=self.bic)
+            if not rivals or self.bic(rivals[0]) > here - _ALIKE:
+                near = [one for one in rivals if self.bic(one) < here + _DECIDED]
+                return best, [one for one in near if len(one.columns) <= len(best.columns) and not _nested(one, best)]
+            lost = tuple(name for name in best.columns if name not in rivals[0].columns)
+            best = rivals[0]
+            self.steps.append(SelectionStep(tuple(best.columns), lost, self.bic(best), None))
 
-    def _likely_swaps(self, best: _TermFit) -> list[tuple[float, _TermFit, list[str], tuple[str, str]]]:
-        """What may do as well as the best fit with one term in the place of another, the likeliest first: its BIC in a
-        linear model, a wider fit, the terms that this is to lose, and the pair (new, old)."""
-        found, here = [], self.bic(best)
-        for new in (name for name in self.path[0].columns if name not in best.columns):
-            for old in best.columns:
-                wanted = {*best.columns, new} - {old}
-                wider = [fit for fit in self.path if wanted <= {*fit.columns}]
-                if not wider:
-                    continue
-                rest = [name for name in wider[-1].columns if name not in wanted]
-                bic = self.bic(wider[-1], wider[-1].loss(rest), len(wider[-1].places(rest)))
-                if bic < here + 2 * _DECIDED:
-                    found.append((bic, wider[-1], rest, (new, old)))
-        return sorted(found, key=lambda one: one[0])
+    def _likely_rivals(self, best: _TermFit) -> list[tuple[float, _TermFit, list[str]]]:
+        """What may do as well as the best fit with other terms, and no more of them, the likeliest first: its BIC in a
+        linear model, a wider fit, and the terms that this is to lose."""
+        kept, widest, found = frozenset(best.columns), self.path[0], {}
+        for new in widest.columns.keys() - kept:
+            found |= dict.fromkeys(kept - {old} | {new} for old in kept)
+        for count in range(1, len(kept) + 1):
+            if math.comb(len(widest.columns), count) <= _MOST_SUBSETS:
+                found |= dict.fromkeys(map(frozenset, itertools.combinations(widest.columns, count)))
+        here, likely = self.bic(best), []
+        for wanted in found:
+            wider = next(fit for fit in reversed(self.path) if wanted <= fit.columns.keys())
+            rest = [name for name in wider.columns if name not in wanted]
+            bic = self.bic(wider, wider.loss(rest), len(wider.places(rest)))
+            if bic < here + 2 * _DECIDED and wanted != kept:
+                likely.append((bic, wider, rest))
+        return sorted(likely, key=lambda one: one[0])
 
     def rows(self) -> list[str]:
         """The lines of the table: a step each, with the terms that left, and what is left."""
