@@ -117,6 +117,7 @@ def fit(
       gradients with optax's Adam: for scenes with neural terms, an `equinox.nn.MLP` in `params0` for instance. With
       more than a hundred free numbers the other methods say in a warning that this one is meant for them.
 
+    Of a law of candidate terms (`lagjax.terms`) in `params0` those are 0 that the motion does not ask for.
     Intervals take the correlation of residuals into account (`Fit.noise`). `Fit.unseen` says in words which parameters
     the data do not determine; their intervals are infinite.
 
@@ -145,6 +146,8 @@ def fit(
     if hold not in HOLDS:
         raise ValueError(f"hold must be one of {', '.join(map(repr, HOLDS))}; got {hold!r}.")
     require_untraced(params0, "params0")
+    if method == "gradient" and any(law.law.selects for law in find_laws(params0)):
+        raise ValueError('method="gradient" chooses no terms: leave it, or fit all terms, dict(law.params0).')
     noise = Gaussian() if noise is None else noise
     if not isinstance(noise, AbstractNoise):
         raise TypeError(f"noise must be lagjax.Gaussian(), StudentT(), Quantised(…) or Clipped(…); got {noise!r}.")

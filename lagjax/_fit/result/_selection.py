@@ -1,9 +1,10 @@
 """Selection: the candidate terms of a law that evidence asks for, by fits of the motion.
 
-The law is fitted with all of its terms. Then the term that is missed least leaves, the others are fitted anew from
-where the linear model puts them, and so forth: a path of nested fits. How much a term is missed is Wald's statistic
-with the covariance that allows for correlated residuals. Of many terms, those that together are missed no more than
-chance has it leave at once. Evidence is
+The law is fitted with all of its terms. About that fit the motion is linear in the numbers of the terms, also where
+these change much, as long as forces change little: so a linear model says which terms explain the most, the first one
+alone, each further one with those before it. The fit takes as many as evidence asks for. Then the term that is missed
+least leaves, the others are fitted anew from where the linear model puts them, and so forth: a path of nested fits.
+Evidence is
 
     BIC = k log(n/λ) − 2 log L/λ
 
@@ -14,8 +15,8 @@ BIC finds the law among laws of which one is true. Where residuals are correlate
 term improves the fit of the records by something that the law is not about. Then records that are left out decide, if
 there are at least three: the smallest law that follows them as well as the best does, within one standard error.
 
-A path of nested fits may lose the better of two terms that are alike. So each term that left is put in the place of
-each that is kept, from the smallest fit that had it, where the linear model says that this may do as well.
+A path of nested fits may lose the better of two terms that are alike. So all small subsets, and each term that left in
+the place of each that is kept, are tried in linear models, and the likeliest are fitted.
 
 Others take many terms out by shrinking (Tibshirani's lasso, sequential thresholds of Brunton, Proctor & Kutz): that
 biases what is kept, and a threshold has units. Source: Miller, *Subset Selection in Regression* (2002); Kent,
@@ -357,8 +358,8 @@ class _PathSearch:
             self.steps.append(SelectionStep(tuple(best.columns), lost, self.bic(best), None))
 
     def _likely_rivals(self, best: _TermFit) -> list[tuple[float, _TermFit, list[str]]]:
-        """What may do as well as the best fit with other terms, and no more of them, the likeliest first: its BIC in a
-        linear model, a wider fit, and the terms that this is to lose."""
+        """Other terms, no more of them, that may do as well as those of the best fit, the likeliest first: their BIC in
+        a linear model, a wider fit, and the terms that it is to lose."""
         kept, widest, found = frozenset(best.columns), self.path[0], {}
         for new in widest.columns.keys() - kept:
             found |= dict.fromkeys(kept - {old} | {new} for old in kept)
