@@ -92,6 +92,7 @@ def select_terms(
     kept = frozenset(best.columns)
     alike = [_alike_sentence([name], same) for name, same in search.same.items() if same and kept.issuperset(same)]
     alike += [_alike_sentence(one.columns.keys() - kept, kept - one.columns.keys()) for one in rivals]
+    alike = list(dict.fromkeys(alike))
     kept, count = tuple(best.columns), len(search.names)
     said = f"Of {count} terms {len(kept)} {'is' if len(kept) == 1 else 'are'} kept, {why}: {', '.join(kept) or 'none'}."
     end = minimise(best.done.residuals, best.done.trial.point, law, _ENOUGH, _TRIALS)
@@ -261,20 +262,19 @@ class _PathSearch:
     path: list[_TermFit]
     steps: list[SelectionStep]
     same: dict[str, list[str]]
-    worth: float = 1.0
-    count: float = 1.0
+    worth: float
+    count: float
     trials: int = 0
 
     @classmethod
     def from_fit(cls, done: Descent, law: AbstractNoise, names: dict[str, str], tell: Callable) -> "_PathSearch":
-        """The search from a fit with all terms, less those that are superfluous at once."""
+        """The search from a fit with all terms."""
         first = _TermFit.from_descent(done, names)
-        found = cls(law, names, tell, [], [], first.find_same())
-        if found.same and (smaller := found.drop(first, list(found.same))) is not None:
-            first = smaller
-        found.worth = 1.0 / first.widening(first.columns)
-        found.count = max(found.worth * done.residuals.measured, 2.0)
-        found.append(first, list(found.same))
+        known, measured = first.known, done.residuals.measured
+        seen = not known.null.shape[1]  # else variances allow for no correlation
+        worth = 1.0 / first.widening(first.columns) if seen else known.effective.sum() / measured
+        found = cls(law, names, tell, [], [], first.find_same(), worth, max(worth * measured, 2.0))
+        found.append(first, [])
         return found
 
     def drop(self, fit: _TermFit, names) -> _TermFit | None:
@@ -296,7 +296,8 @@ class _PathSearch:
 
     def follow(self) -> None:
         """Fits with fewer and fewer terms, as long as a smaller one may be better than the best."""
-        self._leap()
+        if not self._leap() and self.same and (smaller := self.drop(self.path[0], list(self.same))) is not None:
+            self.append(smaller, list(self.same))
         while self.path[-1].columns:
             last = self.path[-1]
             dropped = last.find_least()
@@ -307,19 +308,21 @@ class _PathSearch:
             if -2 * self.worth * smaller.log_likelihood > min(step.bic for step in self.steps):
                 break
 
-    def _leap(self) -> None:
-        """The fit with the terms that explain the most, as many as the linear model of the first fit asks for; only
-        where it is better than that."""
-        first = self.path[-1]
+    def _leap(self) -> bool:
+        """Append the fit with the terms that explain the most, as many as the linear model of the first fit asks for;
+        True where it is better than that."""
+        first = self.path[0]
         order = first.rank_terms()
         rests = [order[count:] for count in range(1, len(order) - 1)]
         bics = [self.bic(first, first.loss(rest), len(first.places(rest))) for rest in rests]
-        if not bics or min(bics) > self.steps[-1].bic:
-            return
+        if not bics or min(bics) > self.steps[0].bic:
+            return False
         rest = rests[int(np.argmin(bics))]
         smaller = self.drop(first, rest)
-        if smaller is not None and self.bic(smaller) < self.steps[-1].bic:
-            self.append(smaller, rest)
+        if smaller is None or self.bic(smaller) > self.steps[0].bic:
+            return False
+        self.append(smaller, rest)
+        return True
 
     def choose(self) -> tuple[_TermFit, str]:
         """The fit that is taken, and what it was chosen by."""
