@@ -40,7 +40,7 @@ from lagjax._fit.result._prediction import Prediction
 from lagjax._fit.result._profile import Profile
 from lagjax._fit.result._report import draw_record
 from lagjax._fit.result._result import Fit
-from lagjax._fit.result._selection import Selection, select_terms
+from lagjax._fit.result._selection import Selection, keep_selected, select_terms
 from lagjax._fit.result._verdict import is_doubtful
 from lagjax._fit.search._multistart import run_multistart
 from lagjax._fit.search._reader import TimeScales, first_starts, read_records, time_scales
@@ -172,6 +172,9 @@ def fit(
         raise ValueError(" ".join([text, *more])) from None
     if not left.doubted:
         return done
+    if (selection := done.selection) is not None:
+        laws = find_laws(params0)
+        search = search._replace(build=lambda records: keep_selected(build(records), selection, laws))
     more = search.find_mistake(given, left, time.process_time() - begun)
     return replace(done, ok=done.ok and not more, message=" ".join([done.message, *more]))
 

@@ -311,6 +311,13 @@ class Parameters:
             names += [name for name, kept_too in zip(self.names[rows], stays, strict=True) if not kept_too]
         return replace(self, first=self.numbers(u), parts=tuple(parts), names=tuple(names))
 
+    def zero(self, u: np.ndarray, stays: np.ndarray) -> "Parameters":
+        """The parameters at u (F,), where the numbers that the unknowns `stays` (F,) move are zero and stay."""
+        fewer = self.fix(u, stays)
+        first = fewer.first.copy()
+        first[np.setdiff1d(self.free_places, fewer.free_places)] = 0.0
+        return replace(fewer, first=first)
+
     def extend(self, u: np.ndarray, rows: slice) -> tuple["Parameters", np.ndarray]:
         """The parameters of one more record with numbers of its own, and u (F,) where these are in the middle of those
         of the records `rows`."""

@@ -27,7 +27,7 @@ import contextlib
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -102,6 +102,14 @@ def select_terms(
     unused = [f"Nothing that was measured depends on {name!r}." for name, same in search.same.items() if not same]
     text = "\n".join([*search.rows(), said, *alike, *unused])
     return end, Selection(kept, tuple(search.steps), tuple(alike), text)
+
+
+def keep_selected(parameters: Parameters, selection: Selection, laws: list[FoundLaw]) -> Parameters:
+    """The parameters without the terms that a selection does not keep."""
+    columns = _term_columns(_label_terms(laws), parameters)
+    lost = [own for name, own in columns.items() if name not in selection.kept]
+    stays = np.isin(np.arange(len(parameters)), np.concatenate([np.zeros(0, int), *lost]))
+    return parameters.zero(parameters.inverse(parameters.first), stays)
 
 
 def _alike_sentence(others, kept) -> str:
@@ -237,10 +245,7 @@ class _TermFit(NamedTuple):
         pull = weight, -weight * self.zero
         step = eliminate(triangles, residuals.states, scale, 1e-14, pull, residuals.unknowns)
         u = parameters.take_step(trial.u, np.where(stays, 0.0, step.u))
-        smaller = parameters.fix(trial.u, stays)
-        first = smaller.first.copy()
-        first[np.setdiff1d(parameters.free_places, smaller.free_places)] = 0.0
-        residuals, begun = residuals.with_parameters(replace(smaller, first=first)), []
+        residuals, begun = residuals.with_parameters(parameters.zero(trial.u, stays)), []
         for point in (Point(u[~stays], trial.starts + step.starts), Point(trial.u[~stays], trial.starts)):
             with contextlib.suppress(LostMotion):
                 there = residuals.evaluate(point)
