@@ -46,8 +46,8 @@ FRICTION = lagjax.terms({
     "motor": against(lambda motor, weight, rise: motor),
     "weight": against(lambda motor, weight, rise: weight),
     "rise": against(lambda motor, weight, rise: rise),
-    "motor, rise": against(lambda motor, weight, rise: motor * rise),
-    "weight, rise": against(lambda motor, weight, rise: weight * rise),
+    "rise by motor": against(lambda motor, weight, rise: motor * rise),
+    "rise by weight": against(lambda motor, weight, rise: weight * rise),
 })  # fmt: skip
 SUPPLY = lagjax.terms({"sag": lambda duty: -duty * jnp.abs(duty)})
 START = {"pull": 1.0, "brake": 0.04, "armature": 1.5e-3, "offset": 0.0, "dry": 0.02}

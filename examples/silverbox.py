@@ -17,7 +17,6 @@ import argparse
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import lagjax
@@ -32,7 +31,6 @@ FRICTION = lagjax.terms({
     "viscous by deflection": lambda q, v: -v * q,
     "viscous by its square": lambda q, v: -v * q**2,
     "cubic": lambda q, v: -(v**3),
-    "dry": lambda q, v: -jnp.tanh(v / 1e-3),
 })  # fmt: skip
 SCENE = lagjax.System(
     lambda q, qdot, params: 0.5 * qdot**2 - POTENTIAL(q, params=params["V"]),

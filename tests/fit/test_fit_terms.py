@@ -1,5 +1,8 @@
 """`lagjax.terms`: laws of candidate terms, from noisy motions whose terms are known, alike terms, and mistakes."""
 
+import importlib
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -180,3 +183,14 @@ def test_a_name_that_is_no_term_is_a_sentence():
         lagjax.simulate(scene, 1.0, 0.0, TS, law.params0 | {"Q2": 1.0})
     with pytest.raises(ValueError, match="gradient"):
         lagjax.fit(scene, lagjax.Record(TS, np.cos(TS)), law.params0, method="gradient")
+
+
+@pytest.mark.slow
+def test_the_silverbox_by_its_own_choice(monkeypatch):
+    root = Path(__file__).parents[2]
+    file = root.parent / "shared" / "data" / "silverbox_multisines.npz"
+    if not file.exists():
+        pytest.skip("the recording is not there")
+    monkeypatch.syspath_prepend(str(root / "examples"))
+    fit, errors = importlib.import_module("silverbox").main([str(file)])
+    assert len(fit.u) <= 9 and errors["left out"] < 0.30  # mV; a block model: 0.96

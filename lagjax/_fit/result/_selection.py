@@ -27,7 +27,7 @@ import contextlib
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -47,8 +47,9 @@ _DECIDED = 6.0  # of BIC: odds of 20 to 1, as those of an interval of 95 %
 _CORRELATED = 0.5  # of neighbouring residuals: beyond, the scene lacks something, and records left out decide
 _FEWEST_RECORDS = 3  # of which one can be left out
 _FOLDS = 4  # groups of records, at most, that are left out in turn: each fit has three quarters of them
-_TRIED_RIVALS = 6  # of the likeliest
+_TRIED_RIVALS = 4  # of the likeliest
 _MOST_SUBSETS = 5000  # of as many terms, all of which are looked at: milliseconds for three of thirty
+_LISTED = 8  # names in one line; of more it says how many there are
 _ALIKE = 1e-3  # of BIC, that two ends of one search differ by
 _TRIED_TOGETHER = 6  # terms up to which one leaves at a time
 _KEPT = 1e6  # over the norm of a column: the weight that holds an unknown in a linear model
@@ -270,6 +271,8 @@ class _PathSearch:
     worth: float
     count: float
     trials: int = 0
+    by_records: bool = False
+    scores: dict[tuple[str, ...], np.ndarray] = field(default_factory=dict)
 
     @classmethod
     def from_fit(cls, done: Descent, law: AbstractNoise, names: dict[str, str], tell: Callable) -> "_PathSearch":
@@ -331,22 +334,27 @@ class _PathSearch:
 
     def choose(self) -> tuple[_TermFit, str]:
         """The fit that is taken, and what it was chosen by."""
-        best = int(np.argmin([step.bic for step in self.steps]))
-        residuals = self.path[best].done.residuals
-        records = len(residuals.records)
-        correlated = np.nanmax(self.path[best].known.correlation) > _CORRELATED
-        if not correlated or records < _FEWEST_RECORDS or len(self.path) == 1:
-            return self.path[best], f"by BIC with {self.count:.0f} effective samples"
-        scores = []
-        for k, fit in enumerate(self.path):
-            done = fit.done
-            _, score = cross_validate(done.residuals, done.trial.point, done.noise, self.law, min(records, _FOLDS))
-            scores.append(score)
-            rms = float(np.exp(np.mean(score)))
-            self.steps[k] = self.steps[k]._replace(left_out=rms)
-            self.tell(f"terms: {', '.join(fit.columns) or 'none'}; RMS {rms:.4g} of records left out")
+        best = self.path[int(np.argmin([step.bic for step in self.steps]))]
+        enough = len(best.done.residuals.records) >= _FEWEST_RECORDS and len(self.path) > 1
+        self.by_records = bool(enough and np.nanmax(best.known.correlation) > _CORRELATED)
+        if not self.by_records:
+            return best, f"by BIC with {self.count:.0f} effective samples"
+        scores = [self.score(fit) for fit in self.path]
         free = tuple(len(fit.done.trial.u) for fit in self.path)
+        rms = [float(np.exp(np.mean(score))) for score in scores]
+        self.steps = [step._replace(left_out=x) for step, x in zip(self.steps, rms, strict=True)]
         return self.path[choose_simplest(free, np.array(scores))], "by records left out and simulated"
+
+    def score(self, fit: _TermFit) -> np.ndarray:
+        """The mean logarithm of RMS residuals of each record where it is left out."""
+        key = tuple(fit.columns)
+        if key not in self.scores:
+            done = fit.done
+            folds = min(len(done.residuals.records), _FOLDS)
+            found = cross_validate(done.residuals, done.trial.point, done.noise, self.law, folds)[1]
+            self.scores[key] = found
+            self.tell(f"terms: {', '.join(key) or 'none'}; RMS {np.exp(np.mean(found)):.4g} of records left out")
+        return self.scores[key]
 
     def exchange(self, best: _TermFit) -> tuple[_TermFit, list[_TermFit]]:
         """The best fit with other terms in the place of some, and those that fit as well, with no more terms."""
@@ -357,13 +365,24 @@ class _PathSearch:
                 if key not in tried and (found := self.drop(wider, rest)) is not None:
                     tried[key] = found
                     self.tell(f"terms: {', '.join(key)}; BIC {self.bic(found):.1f}")
-            here, rivals = self.bic(best), sorted(tried.values(), key=self.bic)
-            if not rivals or self.bic(rivals[0]) > here - _ALIKE:
-                near = [one for one in rivals if self.bic(one) < here + _DECIDED]
+            rivals = [one for one in tried.values() if one.columns.keys() != best.columns.keys()]
+            behind = [self._measure_lag(one, best) for one in rivals]
+            if not rivals or min(lag + least for lag, _, least in behind) > 0:
+                near = [one for one, (lag, most, _) in zip(rivals, behind, strict=True) if lag < most]
                 return best, [one for one in near if len(one.columns) <= len(best.columns) and not _nested(one, best)]
-            lost = tuple(name for name in best.columns if name not in rivals[0].columns)
-            best = rivals[0]
-            self.steps.append(SelectionStep(tuple(best.columns), lost, self.bic(best), None))
+            lost, first = best.columns, rivals[int(np.argmin([lag + least for lag, _, least in behind]))]
+            best, dropped = first, tuple(name for name in lost if name not in first.columns)
+            left_out = float(np.exp(np.mean(self.score(best)))) if self.by_records else None
+            self.steps.append(SelectionStep(tuple(best.columns), dropped, self.bic(best), left_out))
+
+    def _measure_lag(self, rival: _TermFit, best: _TermFit) -> tuple[float, float, float]:
+        """The lag of another fit behind the best one, by BIC or over records left out, the lag up to which it is as
+        good, and the lead that it needs to be taken."""
+        if not self.by_records:
+            return self.bic(rival) - self.bic(best), _DECIDED, _ALIKE
+        behind = self.score(rival) - self.score(best)
+        error = float(behind.std(ddof=1) / np.sqrt(len(behind)))
+        return float(behind.mean()), error, error
 
     def _likely_rivals(self, best: _TermFit) -> list[tuple[float, _TermFit, list[str]]]:
         """Other terms, no more of them, that may do as well as those of the best fit, the likeliest first: their BIC in
@@ -385,12 +404,19 @@ class _PathSearch:
 
     def rows(self) -> list[str]:
         """The lines of the table: a step each, with the terms that left, and what is left."""
-        left = any(step.left_out is not None for step in self.steps)
-        wide = max(len(", ".join(step.dropped)) for step in self.steps)
-        wide = max(wide, len("without"))
-        rows = [f"{'without':<{wide}}{'BIC':>12}{'RMS left out' if left else '':>{14 * left}}  terms"]
-        for step in self.steps:
-            rms = "" if step.left_out is None else f"{step.left_out:.4g}"
-            terms = ", ".join(step.terms) or "none"
-            rows.append(f"{', '.join(step.dropped):<{wide}}{step.bic:>12.1f}{rms:>{14 * left}}  {terms}")
-        return rows
+        heads = ["without", "BIC", "RMS left out", "terms"]
+        rows = [
+            [_list_names(step.dropped), f"{step.bic:.1f}", f"{step.left_out:.4g}" if step.left_out else "",
+             _list_names(step.terms) or "none"]
+            for step in self.steps
+        ]  # fmt: skip
+        widths = [max(len(row[k]) for row in [heads, *rows]) for k in range(3)]
+        if not any(row[2] for row in rows):
+            heads[2], widths[2] = "", 0
+        aligns = (str.ljust, str.rjust, str.rjust)
+        cut = [[align(row[k], widths[k]) for k, align in enumerate(aligns) if widths[k]] for row in [heads, *rows]]
+        return ["  ".join([*cells, row[3]]) for cells, row in zip(cut, [heads, *rows], strict=True)]
+
+
+def _list_names(names: tuple[str, ...]) -> str:
+    return ", ".join(names) if len(names) <= _LISTED else f"{len(names)} terms"
