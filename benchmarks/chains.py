@@ -131,8 +131,8 @@ def main(argv=None):
             f"{one['terms']} terms, {one['cpu_s']} CPU s{'' if one['ok'] else ', NOT OK: ' + one['message']}",
             flush=True,
         )
-    if options.out:
-        options.out.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        if options.out:
+            options.out.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return found
 
 

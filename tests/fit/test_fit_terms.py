@@ -59,6 +59,7 @@ def assert_truth(fit, true):
 def test_a_potential_is_found_among_powers_and_cosine(numbers):
     law, scene = potential(POWERS)
     true = law.params0 | numbers
+    assert {type(number) for number in (true | {"q6": 0}).values()} == {float}
     fit = lagjax.fit(scene, record(scene, 2.0, true), law.params0)
     assert_truth(fit, true)
     assert type(fit.params) is type(law.params0) and str(fit.selection) in str(fit)

@@ -39,7 +39,9 @@ class LawParameters(dict):
         self.law = law
 
     def __or__(self, other):
-        return LawParameters(self.law, {**self, **other})
+        # A number of a term that is written without a point is a float, which a fit moves, as the others are.
+        whole = {name: float(number) if type(number) is int else number for name, number in other.items()}
+        return LawParameters(self.law, {**self, **whole})
 
     def copy(self) -> "LawParameters":
         return LawParameters(self.law, self)
