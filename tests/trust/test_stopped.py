@@ -1,5 +1,7 @@
 """A motion that stops is named by what it ran into, and by both engines alike, member by member."""
 
+import re
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -122,6 +124,29 @@ def test_the_message_tells_what_it_ran_into(name):
     lagrangian, forces, q0, qdot0, more, expected = STOPS[name]
     with pytest.raises(lagjax.SimulationError, match=expected):
         lagjax.simulate(lagjax.System(lagrangian, forces=forces), q0, qdot0, TS, **more)
+
+
+def test_scenes_of_one_text_are_told_their_own_lines():
+    """They are derived once; the line is that of the functions of each."""
+    scenes = (
+        lagjax.System(lambda q, v: 0.5 * v**2 + 1 / q**3),
+        lagjax.System(lambda q, v: 0.5 * v**2 + 1 / q**3),
+    )
+    kinks = (
+        lagjax.System(lambda q, v: 0.5 * v**2 - jnp.abs(q - 3.0)),
+        lagjax.System(lambda q, v: 0.5 * v**2 - jnp.abs(q - 3.0)),
+    )
+    lines = []
+    for scene, kink in zip(scenes, kinks, strict=True):
+        with pytest.raises(lagjax.SimulationError) as stopped:
+            lagjax.simulate(scene, 1.0, 0.0, TS)
+        with pytest.raises(ValueError, match="is on a border") as rough:
+            lagjax.linearize(kink, 3.0)
+        said = str(stopped.value), str(rough.value), *map(str, lagjax.check(kink, 3.0, 0.0))
+        lines.append([re.findall(r"test_stopped.py:(\d+)", text) for text in said])
+        assert all(lines[-1])
+    first, second = np.array(lines[0], int), np.array(lines[1], int)
+    np.testing.assert_array_equal(second - first, 1)
 
 
 def test_the_health_of_a_batch_tells_it_of_the_first_that_failed():
