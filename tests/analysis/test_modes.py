@@ -350,8 +350,8 @@ def test_nothing_is_linear_at_a_border(name):
     "force, frequency",
     [
         (lambda q, qdot: -0.1 * qdot * jnp.abs(qdot), np.sqrt(2)),  # smooth at rest, though abs is not
-        (lambda q, qdot: -3 * jnp.maximum(q, 0.0) ** 2, np.sqrt(2)),
-        (lambda q, qdot: -jnp.clip(q, -1.0, 1.0), np.sqrt(3)),  # no border here
+        pytest.param(lambda q, qdot: -3 * jnp.maximum(q, 0.0) ** 2, np.sqrt(2), marks=pytest.mark.slow),
+        pytest.param(lambda q, qdot: -jnp.clip(q, -1.0, 1.0), np.sqrt(3), marks=pytest.mark.slow),  # no border here
         (lambda q, qdot: -q * jnp.where(jnp.abs(qdot) < 1e-6, 1.0, 2.0), np.sqrt(3)),  # one that is beside
     ],
 )

@@ -123,7 +123,7 @@ def in_a_process(call: str):
 
 def test_nothing_hangs_or_crashes():
     in_a_process(
-        "t.interrupt_a_batch(); t.interrupt_a_single_member(); t.run_on_many_threads(); t.fork_during_a_batch(); "
+        "t.interrupt_a_batch(4); t.interrupt_a_single_member(4); t.run_on_many_threads(); t.fork_during_a_batch(1); "
         "t.leave_during_a_batch()"
     )
 

@@ -295,7 +295,9 @@ RECORD = {
 }
 
 
-@pytest.mark.parametrize("part", ["errors", "mixed", "constraints", *RECORD])
+@pytest.mark.parametrize(
+    "part", sweep(["errors", "mixed", "constraints", *RECORD], kept=["errors", "sizes", "latency"])
+)
 def test_figure(tmp_path, part):
     pytest.importorskip("matplotlib", reason="figures need matplotlib")
     record = {part: {"rows": RECORD[part]} if part in RECORD else comparison_of({"lagjax": 1.0, "numba": 1.01})}
