@@ -124,7 +124,11 @@ def test_reduced_equations_have_the_fewest_states():
     )
     closed = reduced.A - reduced.B[:, :1] @ reduced.B[:, :1].T @ regulator
     assert np.linalg.eigvals(closed).real.max() < 0
-    # Along a skate's motion its blade turns with it: x' sin φ − y' cos φ keeps (δφ, δx', δy') in a plane.
+
+
+@pytest.mark.slow
+def test_a_blade_turns_with_its_skate():
+    """x' sin φ − y' cos φ keeps (δφ, δx', δy') in a plane."""
     sliding = lagjax.linearize(SKATE, np.zeros(3), np.array([2.0, 0.0, 0.0])).reduced()
     assert sliding.A.shape == (5, 5)
     np.testing.assert_allclose(2.0 * sliding.basis[2] - sliding.basis[4], 0.0, atol=1e-14)

@@ -814,7 +814,7 @@ def test_outputs_at_the_start_vary_where_a_contact_closes_there(up):
         np.testing.assert_allclose(np.stack(slopes, 1), expected, atol=1e-14)
 
 
-@pytest.mark.parametrize("law", ["linear", "pieces"])
+@pytest.mark.parametrize("law", [pytest.param("linear", marks=pytest.mark.slow), "pieces"])
 def test_forces_read_normal_forces_in_a_scene_whose_first_motion_is_traced(law):
     """It falls and slides on against a drag c N ẋ: x = t₁ + (1 − exp(−c g (2 − t₁))) / (c g)."""
 

@@ -171,6 +171,11 @@ def test_results_of_the_analysis_read_as_sentences():
     found = lagjax.results.Equilibrium({"x": np.array([0.0, -1.0])}, {"rod": np.array(0.5)}, np.array(True))
     assert str(found) == "Equilibrium at q['x'][0] = 0, q['x'][1] = -1; multipliers['rod'] = 0.5"
     assert str(lagjax.linearize(pendulum, 0.0)) == "δq'' = -1 δq +1 u"
+
+
+@pytest.mark.slow
+def test_results_of_motions_read_as_sentences():
+    pendulum = PENDULUM
     assert str(lagjax.lyapunov_exponent(pendulum, 0.5, 0.0, 5.0)).startswith("Lyapunov exponent -0.0")
     path = lagjax.find_path(pendulum, 0.0, 0.5, 0.0, 1.0)
     assert repr(path).startswith("Path: action 1.08090018, a minimum among nearby paths, 0 conjugate times")

@@ -1021,5 +1021,5 @@ def test_short_motions_from_a_traced_mode_on_are_one_motion_in_a_batch():
         return lagjax.simulate(scene, q0, 0.0, jnp.array([0.0, 3.0]), throw=False).q[-1]
 
     starts = np.linspace(0.8, 1.2, 4)
-    given, expected = (jax.vmap(jax.value_and_grad(of))(starts) for of in (in_parts, whole))
+    given, expected = (jax.jit(jax.vmap(jax.value_and_grad(of)))(starts) for of in (in_parts, whole))
     np.testing.assert_allclose(given, expected, rtol=1e-9)

@@ -303,7 +303,7 @@ def test_a_jump_beside_a_root_that_is_singular_elsewhere(slow):
 @pytest.mark.parametrize(
     ("kind", "derivative"),
     [
-        ("constraints", jax.jacrev),
+        pytest.param("constraints", jax.jacrev, marks=pytest.mark.slow),
         ("contacts", jax.jacfwd),
         pytest.param("constraints", jax.jacfwd, marks=pytest.mark.slow),
         pytest.param("contacts", jax.jacrev, marks=pytest.mark.slow),

@@ -463,12 +463,17 @@ def test_what_a_scene_does(off):
     kepler = KEPLER
     found = lagjax.conserved_quantities(kepler, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.2]))
     assert [charge.name for charge in found] == ["energy", "angular momentum in the plane 01"]
+    assert lagjax.same_motion(BALL, lagjax.System(lambda q, v: v**2 - 2 * 9.81 * q), 0.0, 1.0).same
+
+
+@pytest.mark.slow
+def test_what_motions_of_a_scene_do(off):
+    params = {"m": 1.0, "l": LENGTH}
     orbit = lagjax.periodic_orbit(SCENE, 1.0, 0.0, 1.2, params)
     agrees(orbit.period, in_double(lambda *x: lagjax.periodic_orbit(SCENE, 1.0, 0.0, 1.2, params).period), 2)
     path = lagjax.find_path(BALL, 0.0, 1.0, 0.0, 0.5)
     assert abs(path.trajectory.q[-1] - 1.0) <= 2 * EPS
     assert lagjax.lyapunov_spectrum(SCENE, 1.0, 0.0, 5.0, params).dtype == np.float32
-    assert lagjax.same_motion(BALL, lagjax.System(lambda q, v: v**2 - 2 * 9.81 * q), 0.0, 1.0).same
 
 
 def test_parameters_from_recordings(off):

@@ -87,7 +87,7 @@ def test_a_thousand_blocks_rest_from_the_start_or_stop_together():
     assert (rest.q[-1] == rest.q[0]).all()
 
 
-@pytest.mark.parametrize("count", [2, 8])
+@pytest.mark.parametrize("count", [2, pytest.param(8, marks=pytest.mark.slow)])
 def test_a_chain_rests_as_long_as_its_joints_hold(count):
     q0 = 0.4 + 0.1 * np.cos(np.arange(count))
     limit, scene, ts = np.abs(torques(q0)).max(), chain(count), np.array([0.0, 1.0])
