@@ -173,11 +173,13 @@ def test_wrong_arguments(arguments, sentence):
     assert sentence in str(error.value)
 
 
+MOVED = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q, inputs: q[0] - inputs)
+
+
 def test_inputs_that_nothing_or_a_constraint_reads():
     with pytest.raises(ValueError, match="no function of the scene asks for `inputs`"):
         lagjax.linearize(PLAIN, TOP, params=M, inputs=1.0)
-    moved = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q, inputs: q[0] - inputs)
     with pytest.raises(ValueError, match="constraints asks for `inputs`"):
-        lagjax.linearize(moved, np.zeros(2), inputs=0.0)
+        lagjax.linearize(MOVED, np.zeros(2), inputs=0.0)
     with pytest.raises(AttributeError, match="call linearize"):
         _ = lagjax.linearize(ROD, np.array([0.0, -L])).Phi

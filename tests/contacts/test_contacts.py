@@ -153,14 +153,16 @@ def test_a_motion_goes_on_from_where_it_came_to_an_impact():
         lagjax.simulate(DROP, -1e-6, 1.0, np.array([0.0, 1.0]))
 
 
+SPRING_OVER_A_FLOOR = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2, contacts=lambda q: q, restitution=0.8)
+
+
 def test_a_stretch_of_many_steps_is_finished_in_threads_of_xla_too(monkeypatch):
     # These take the smallest numbers for zero: whether a kernel has more to do must not be one. A kernel of few rounds
     # needs a scene of its own.
     monkeypatch.setattr("lagjax._run.jumps._scene_code._ROUNDS", 1)
-    spring = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2, contacts=lambda q: q, restitution=0.8)
 
     def end(h):
-        return lagjax.simulate(spring, h, 0.0, np.array([0.0, 2.0])).q[-1]
+        return lagjax.simulate(SPRING_OVER_A_FLOOR, h, 0.0, np.array([0.0, 2.0])).q[-1]
 
     slope = 0.8 * np.sin(2.0 - np.pi / 2)  # q = h cos t, and −0.8 h cos t behind the floor
     np.testing.assert_allclose(end(1.5), 1.5 * slope, rtol=1e-11)
@@ -784,15 +786,17 @@ def test_beads_that_do_not_rebound_share_their_momentum():
     np.testing.assert_allclose(run.qdot[-1], np.full(n, 1 / n), atol=1e-14)
 
 
+ROW_OF_BEADS = lagjax.System(
+    lambda q, v: 0.5 * jnp.sum(v**2), contacts=lambda q: q[1:] - q[:-1] - 0.5, restitution=lambda params: params
+)
+
+
 def test_derivatives_of_thirty_contacts():
     """The last bead of a row that passes a blow on has a speed in closed form, ((1 + e)/2)ⁿ⁻¹."""
     n = 26
-    row = lagjax.System(
-        lambda q, v: 0.5 * jnp.sum(v**2), contacts=lambda q: q[1:] - q[:-1] - 0.5, restitution=lambda params: params
-    )
 
     def last(e):
-        return lagjax.simulate(row, np.arange(n) * 1.0, np.eye(n)[0], np.array([0.0, 20.0]), e).qdot[-1, -1]
+        return lagjax.simulate(ROW_OF_BEADS, np.arange(n) * 1.0, np.eye(n)[0], np.array([0.0, 20.0]), e).qdot[-1, -1]
 
     e, blows = 0.95, n - 1
     value, slope = jax.jit(jax.value_and_grad(last))(e)

@@ -290,15 +290,19 @@ def test_the_gain_of_an_experiment_is_that_of_the_fit_with_its_data():
     assert logs[0] - logs[1] == pytest.approx(table.gain[0], rel=0.2)
 
 
+def magnet(q, v, params):
+    return 0.5 * params["m"] * v**2 - 0.5 * params["k"] * q**2 - jnp.exp(5.0 * (q - 8.0))
+
+
+MAGNET = lagjax.System(magnet)
+
+
 def test_an_experiment_that_sees_what_is_not_seen_comes_first():
     # Free motion tells k/m alone; the force of a magnet at large q tells m.
-    def magnet(q, v, params):
-        return 0.5 * params["m"] * v**2 - 0.5 * params["k"] * q**2 - jnp.exp(5.0 * (q - 8.0))
 
-    scene = lagjax.System(magnet)
-    values = np.asarray(lagjax.simulate(scene, 1.0, 0.0, SHORT, {"m": 1.0, "k": 4.0}).q)
+    values = np.asarray(lagjax.simulate(MAGNET, 1.0, 0.0, SHORT, {"m": 1.0, "k": 4.0}).q)
     one = lagjax.Record(SHORT, values + 0.02 * np.random.default_rng(0).normal(size=values.shape))
-    fit = lagjax.fit(scene, one, {"m": 1.0, "k": 3.0}, transforms=lagjax.positive)
+    fit = lagjax.fit(MAGNET, one, {"m": 1.0, "k": 3.0}, transforms=lagjax.positive)
     assert len(fit.unseen) == 1
     table = fit.next_experiment([plan(9.0), plan(1.0, (7.0, 0.0))])
     assert table.names == ("[1]", "[0]") and table.newly_seen.tolist() == [1, 0]

@@ -549,13 +549,15 @@ def _gap(i):
     return lambda q, v: q[i + 1] - q[i]
 
 
+DROPPED_TOGETHER = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - G * jnp.sum(q))
+
+
 @pytest.mark.slow
 def test_balls_dropped_together_stay_above_the_floor():
-    scene = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - G * jnp.sum(q))
     floors = [lagjax.Transition("a", "a", lambda q, v: q[0], -1, lambda q, v: (q, v.at[0].multiply(-0.9))),
               lagjax.Transition("a", "a", lambda q, v: q[1], -1, lambda q, v: (q, v.at[1].multiply(-0.9)))]  # fmt: skip
     h, e = (x.ravel() for x in np.meshgrid(np.linspace(0.5, 3.0, 40), [0.0, 3e-15, 1e-14, -1e-14, 1e-13, 1e-12]))
-    run = lambda h, e: hybrid({"a": scene}, floors, jnp.stack([h, h * (1 + e)]), jnp.zeros(2), (0.0, 2.0))
+    run = lambda h, e: hybrid({"a": DROPPED_TOGETHER}, floors, jnp.stack([h, h * (1 + e)]), jnp.zeros(2), (0.0, 2.0))
     runs = jax.jit(jax.vmap(run))(h, e)
     alone = jax.jit(jax.vmap(lambda h: bouncing(h, 0.9, ts=jnp.array([0.0, 2.0]))))(h)
     # Rounding of the height, and of the time at the speed of the fall.

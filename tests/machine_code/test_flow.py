@@ -143,11 +143,13 @@ def test_a_jacobian_row_by_row_is_that_column_by_column():
     np.testing.assert_allclose(jax.jacrev(lambda x: path(x)[-1:])(x), exact(x)[-1:], atol=1e-9)
 
 
+# The bead's ellipse depends on a parameter; outputs are put on it, and so are the ends of steps.
+ON_A_CONSTRAINT = lagjax.System(sliding, constraints=ellipse)
+
+
 @pytest.mark.slow
 def test_gradients_on_a_constraint():
-    # The bead's ellipse depends on a parameter; outputs are put on it, and so are the ends of steps.
-    system = lagjax.System(sliding, constraints=ellipse)
-    value = lambda p: loss(system, jnp.linspace(0, 1.2, 5))(jnp.array([0.0, -1.0]), jnp.array([1.5, 0.0]), p)
+    value = lambda p: loss(ON_A_CONSTRAINT, jnp.linspace(0, 1.2, 5))(jnp.array([0.0, -1.0]), jnp.array([1.5, 0.0]), p)
     params = {"m": 1.3, "a": 1.7}
     reverse, forward = jax.grad(value)(params), jax.jacfwd(value)(params)
     np.testing.assert_allclose(reverse["a"], forward["a"], rtol=1e-8)

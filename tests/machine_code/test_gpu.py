@@ -194,11 +194,13 @@ def test_derivatives_with_constraints(on_the_ptx):
         agree(on_the_ptx(function, *given), jax.jit(function)(*given), 1e-8)
 
 
+PIECEWISE = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
+
+
 @pytest.mark.slow
 def test_borders_of_a_piecewise_scene(on_the_ptx):
-    system = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
-    here = on_the_ptx(lambda q0: motion(system, q0, 0.0, 5.0 * TS), 1.0)
-    agree(here, jax.jit(lambda q0: motion(system, q0, 0.0, 5.0 * TS))(1.0))
+    here = on_the_ptx(lambda q0: motion(PIECEWISE, q0, 0.0, 5.0 * TS), 1.0)
+    agree(here, jax.jit(lambda q0: motion(PIECEWISE, q0, 0.0, 5.0 * TS))(1.0))
 
 
 @pytest.mark.slow
@@ -259,16 +261,18 @@ def test_gradients_of_motions_that_fail_are_those_of_the_cpu(on_the_ptx, of):
     assert np.isnan(there).any() == (of == "end")
 
 
+FALLING = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["few", "many", "no numbers", "borders", "in memory", "own times"])
 def test_transposes(on_the_ptx, case):
     chain, pendulum, ends = scenes.chain(4), scenes.pendulum(), np.arange(-1.0, 2.0)  # back, not at all, and on
-    falling = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
     derivative, given = {
         "few": (jax.jacrev(lambda q0: motion(pendulum, q0, 0.0)[0][1:3]), (1.0,)),
         "many": (jax.jacrev(lambda q0: motion(pendulum, q0, 0.0)[0]), (1.0,)),
         "no numbers": (jax.grad(lambda q0: swung(q0, lagjax.System(lambda q, v: 0.5 * v**2 - q**4))), (1.0,)),
-        "borders": (jax.grad(lambda q0: swung(q0, falling, 5.0 * TS)), (1.0,)),
+        "borders": (jax.grad(lambda q0: swung(q0, FALLING, 5.0 * TS)), (1.0,)),
         "in memory": (jax.grad(lambda q0, p: swung(q0, chain, params=p), (0, 1)), (chain.q0, chain.params)),
         "own times": (jax.vmap(jax.grad(lambda q0, end: swung(q0, ts=end * TS), (0, 1))), (np.ones(3), ends)),
     }[case]  # fmt: skip
@@ -306,10 +310,12 @@ def in_single(scene, q0, ts=TS, **how):
     return run.q, run.qdot, run.result._value
 
 
+DRIVEN_IN_TIME = lagjax.System(lambda q, qdot, t, params: 0.5 * qdot**2 + q * jnp.cos(params["w"] * t))
+
+
 def test_the_time_of_single_precision_is_a_double(on_the_ptx):
     """After a thousand turns of the drive it has four digits as a float: the force would be wrong by a hundredth."""
-    system = lagjax.System(lambda q, qdot, t, params: 0.5 * qdot**2 + q * jnp.cos(params["w"] * t))
-    scene = SimpleNamespace(system=system, qdot0=0.0, params={"w": 3.7})
+    scene = SimpleNamespace(system=DRIVEN_IN_TIME, qdot0=0.0, params={"w": 3.7})
 
     def driven(q0):
         return in_single(scene, q0, 2000.0 + TS)[:2]

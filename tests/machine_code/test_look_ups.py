@@ -206,25 +206,29 @@ def test_a_step_by_digitize(right):
         np.testing.assert_allclose(found[1], known[1], atol=1e-10)
 
 
+def force_of_field(q, qdot, params):
+    return -q - jnp.stack([height_of_field(params["x"], params["y"], g, *q) for g in (params["g"], params["g"].T)])
+
+
+def height_of_field(x, y, g, a, b):
+    i, j = (jnp.clip(jnp.searchsorted(k, z, side="right") - 1, 0, len(k) - 2) for k, z in ((x, a), (y, b)))
+    s, t = (a - x[i]) / (x[i + 1] - x[i]), (b - y[j]) / (y[j + 1] - y[j])
+    low, high = (1 - t) * g[i, j] + t * g[i, j + 1], (1 - t) * g[i + 1, j] + t * g[i + 1, j + 1]
+    return (1 - s) * low + s * high
+
+
+ON_A_GRID = lagjax.System(free_particles, forces=force_of_field)
+
+
 @pytest.mark.slow
 def test_a_field_on_a_grid():
     """Bilinear between knots of two axes; axes and heights that are not separable, by differences."""
 
-    def height(x, y, g, a, b):
-        i, j = (jnp.clip(jnp.searchsorted(k, z, side="right") - 1, 0, len(k) - 2) for k, z in ((x, a), (y, b)))
-        s, t = (a - x[i]) / (x[i + 1] - x[i]), (b - y[j]) / (y[j + 1] - y[j])
-        low, high = (1 - t) * g[i, j] + t * g[i, j + 1], (1 - t) * g[i + 1, j] + t * g[i + 1, j + 1]
-        return (1 - s) * low + s * high
-
-    def force(q, qdot, params):
-        return -q - jnp.stack([height(params["x"], params["y"], g, *q) for g in (params["g"], params["g"].T)])
-
-    scene = lagjax.System(free_particles, forces=force)
     params = {"x": jnp.asarray(KNOTS), "y": jnp.asarray(KNOTS + 0.03), "g": jnp.outer(VALUES, VALUES**2)}
 
     def end(p):
         ts = jnp.array([0.0, 2.0])
-        return lagjax.simulate(scene, jnp.array([-0.3, 0.2]), jnp.array([0.8, 0.5]), ts, p, solver=MACHINE).q[-1, 0]
+        return lagjax.simulate(ON_A_GRID, jnp.array([-0.3, 0.2]), jnp.array([0.8, 0.5]), ts, p, solver=MACHINE).q[-1, 0]
 
     slopes = jax.grad(end)(params)
     for name in params:

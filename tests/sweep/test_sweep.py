@@ -160,22 +160,24 @@ def beside_it(q, qdot):
     return q - 0.1
 
 
+DISK = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - GRAVITY * q[1], constraints=lambda q: jnp.sum(q**2) - 1.0)
+
+
 @pytest.mark.slow
 def test_crossings_of_several_sections_under_constraints(tmp_path):
-    disk = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - GRAVITY * q[1], constraints=lambda q: jnp.sum(q**2) - 1.0)
     sections = {"bottom": lambda q, v: q[0], "height": lambda q, v, t: q[1] + 0.8 + 0.01 * t}
     angles = np.linspace(0.1, 1.5, 9)
     on_it = lambda angle: jnp.stack([jnp.sin(angle), -jnp.cos(angle)])
     q0 = lambda point: (1.0 + 1e-3 * (point["angle"] > 1.4)) * on_it(point["angle"])
     keep = lambda trajectory, crossings: {"times": {name: x.t for name, x in crossings.items()}}
     run = run_sweep(
-        disk, {"angle": angles}, np.array([0.0, 1.0]), q0=q0, qdot0=np.zeros(2), keep=keep,
+        DISK, {"angle": angles}, np.array([0.0, 1.0]), q0=q0, qdot0=np.zeros(2), keep=keep,
         crossings={"section": sections, "count": 3}, store=tmp_path / "store", progress=False,
     )  # fmt: skip
     data = run.open()
     assert run.status().results == {"successful": 8, "inconsistent_start": 1}
     assert np.isnan(data["times.bottom"][8]).all()
-    alone = lagjax.crossings(disk, sections, on_it(angles[3]), jnp.zeros(2), jnp.array([0.0, 1.0]), count=3)
+    alone = lagjax.crossings(DISK, sections, on_it(angles[3]), jnp.zeros(2), jnp.array([0.0, 1.0]), count=3)
     for name in sections:
         np.testing.assert_allclose(data[f"times.{name}"][3], alone[name].t, rtol=1e-9)
 

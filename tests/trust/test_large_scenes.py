@@ -156,14 +156,18 @@ def test_the_spectrum_of_a_sparse_mass_matrix(kind):
     assert np.abs(mass @ direction).max() < 0.1 * np.abs(direction).max()
 
 
+def attraction(q, qdot):
+    apart = jnp.sum((q[:, None] - q) ** 2, axis=-1)
+    return 0.5 * jnp.sum(qdot**2) + jnp.sum(1 / jnp.sqrt(apart + 1.0))
+
+
+BODIES = lagjax.System(attraction)
+
+
 def test_a_scene_too_large_for_the_machine_says_so():
-    def attraction(q, qdot):
-        apart = jnp.sum((q[:, None] - q) ** 2, axis=-1)
-        return 0.5 * jnp.sum(qdot**2) + jnp.sum(1 / jnp.sqrt(apart + 1.0))
 
     many, still = np.zeros((10**6, 3)), np.zeros((10**6, 3))
-    bodies = lagjax.System(attraction)
-    for ask in (lambda: lagjax.simulate(bodies, many, still, TS), lambda: bodies.acceleration(many, still)):
+    for ask in (lambda: lagjax.simulate(BODIES, many, still, TS), lambda: BODIES.acceleration(many, still)):
         with pytest.raises(ValueError, match=r"gradient of this L, of 3000000 coordinates, would take some .* GiB"):
             ask()
     free = FREE_POINTS
