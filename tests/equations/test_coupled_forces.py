@@ -399,7 +399,7 @@ def rub_each(q, v, params, multipliers):
 
 
 TWO_BEADS = lagjax.System(
-    lambda q, v: gravity(q[0], v[0]) + gravity(q[1], v[1]), rub_each=rub_each,
+    lambda q, v: gravity(q[0], v[0]) + gravity(q[1], v[1]), forces=rub_each,
     constraints=lambda q: jnp.sum(q * q, axis=1) - 1.0,
 )  # fmt: skip
 
@@ -419,7 +419,7 @@ def rub_first_bearing(q, v, params, multipliers):
 
 
 DOUBLE = lagjax.System(
-    lambda q, v: gravity(q[0], v[0]) + gravity(q[1], v[1]), rub_first_bearing=rub_first_bearing,
+    lambda q, v: gravity(q[0], v[0]) + gravity(q[1], v[1]), forces=rub_first_bearing,
     constraints=lambda q: jnp.stack([q[0] @ q[0], (q[1] - q[0]) @ (q[1] - q[0])]) - 1.0,
 )  # fmt: skip
 
@@ -442,7 +442,7 @@ def push_by_both_multipliers(q, v, multipliers):
     return {"x": 0.0 * q["x"], "y": 0.1 * multipliers["y"], "phi": torque}
 
 
-LINEAR_LAW = lagjax.System(pendulum, push_by_both_multipliers=push_by_both_multipliers, constraints=bearing)
+LINEAR_LAW = lagjax.System(pendulum, forces=push_by_both_multipliers, constraints=bearing)
 
 
 def test_a_law_that_is_linear_in_several_multipliers_needs_no_sign():
@@ -577,7 +577,7 @@ def lift_and_drag(q, v, t, params, multipliers):
     return jnp.array([-params * multipliers["floor"], (t - 1) * (3 - t)])
 
 
-LIFTED_BLOCK = lagjax.System(lambda q, v: 0.5 * v @ v, lift_and_drag=lift_and_drag, contacts=lambda q: {"floor": q[1]})
+LIFTED_BLOCK = lagjax.System(lambda q, v: 0.5 * v @ v, forces=lift_and_drag, contacts=lambda q: {"floor": q[1]})
 
 
 def test_a_normal_force_that_is_read_while_its_contact_opens_and_closes():
@@ -602,7 +602,7 @@ def brake_foot(q, v, multipliers):
 
 
 STANDING = lagjax.System(
-    lambda q, v: 0.5 * v @ v - G * (q[1] + q[3]), brake_foot=brake_foot,
+    lambda q, v: 0.5 * v @ v - G * (q[1] + q[3]), forces=brake_foot,
     constraints=lambda q: {"rod": q[3] - q[1] - 1.0}, contacts=lambda q: {"floor": q[1]},
 )  # fmt: skip
 
@@ -615,7 +615,7 @@ def test_constraints_beside_closed_contacts_have_their_own_multipliers():
     np.testing.assert_allclose(run.contact_forces["floor"], [2 * G, 2 * G], rtol=1e-12)
     np.testing.assert_allclose(run.constraint_force()[1], [0, -G, 0, G], rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(run.qdot[-1], [1 - 0.2 * G, 0, 1 - 0.2 * G, 0], rtol=1e-11, atol=1e-12)
-    with pytest.raises(ValueError, match="for brake_foot that read no multipliers"):
+    with pytest.raises(ValueError, match="for forces that read no multipliers"):
         lagjax.equilibrium(STANDING, run.q[0])
 
 
@@ -628,12 +628,12 @@ def corners_of_box(q):
     return {f"{x}{y}": q[1] + s * x + c * y for x in (-1, 1) for y in (-1, 1)}
 
 
-BOX = lagjax.System(lambda q, v: 0.5 * v @ v - G * q[1], rub_box=rub_box, contacts=corners_of_box)
+BOX = lagjax.System(lambda q, v: 0.5 * v @ v - G * q[1], forces=rub_box, contacts=corners_of_box)
 
 
 @pytest.mark.slow
 def test_normal_forces_of_more_contacts_than_a_body_needs():
-    """A box on four corners_of_box, of which two touch the floor: their sum is its weight, whichever carries it."""
+    """A box on four corners, of which two touch the floor: their sum is its weight, whichever carries it."""
 
     run = lagjax.simulate(BOX, jnp.array([0.0, 1.0, 0.0]), jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 0.2, 2.0]))
     np.testing.assert_allclose(run.q[1:, 0], [0.2 - 0.004 * G, 1 / (0.4 * G)], rtol=1e-11)

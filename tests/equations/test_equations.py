@@ -167,7 +167,7 @@ def forces_with_borders(q, v, t):
     return jnp.where(t > 5, 1.0, 0.0) - 0.2 * jnp.sign(v) + jnp.floor(q) * jnp.exp(-((t / 0.01) ** 2))
 
 
-BORDERED = lagjax.System(free_particle, forces_with_borders=forces_with_borders)
+BORDERED = lagjax.System(free_particle, forces=forces_with_borders)
 
 
 def test_explain_names_borders_and_says_whether_they_are_located():
@@ -180,7 +180,7 @@ def test_explain_names_borders_and_says_whether_they_are_located():
     assert "borders" not in str(smooth)
     single = BORDERED.explain(np.float32(0.0), np.float32(1.0))
     assert single.borders == facts.borders and single.borders_located
-    arrays = lagjax.System(free_particle, forces_with_borders=forces_with_borders, path="array").explain(0.0, 1.0)
+    arrays = lagjax.System(free_particle, forces=forces_with_borders, path="array").explain(0.0, 1.0)
     assert not arrays.borders_located
 
 

@@ -276,7 +276,7 @@ def drive_silverbox(q, qdot, params, inputs):
     return params["gain"] * inputs - params["c"] * qdot + params["bias"]
 
 
-SILVERBOX = lagjax.System(silverbox, drive_silverbox=drive_silverbox)
+SILVERBOX = lagjax.System(silverbox, forces=drive_silverbox)
 
 
 @pytest.mark.slow

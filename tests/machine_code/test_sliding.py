@@ -168,7 +168,7 @@ def forces_beside_coupled(q, v, params):
     return -params * jnp.sign(v) - 0.1 * between * jnp.array([1.0, -1.0, 0.0, 0.0, 0.0, 0.0])
 
 
-BESIDE_COUPLED = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q, forces_beside_coupled=forces_beside_coupled)
+BESIDE_COUPLED = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q, forces=forces_beside_coupled)
 
 
 def test_sites_that_stop_at_one_instant_stop_beside_coupled_ones():
