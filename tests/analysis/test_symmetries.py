@@ -146,12 +146,16 @@ def test_no_false_report_on_100_random_systems():
         assert names(RANDOM, np.asarray(draw(size=3)), np.asarray(draw(size=3)), params) == ["energy"], seed
 
 
+def screw(q, v):
+    return 0.5 * v @ v - jnp.cos(jnp.arctan2(q[1], q[0]) - 2 * q[2]) * (q[0] ** 2 + q[1] ** 2)
+
+
+SCREW = lagjax.System(screw)
+
+
 @pytest.mark.slow
 def test_combinations():
-    def screw(q, v):
-        return 0.5 * v @ v - jnp.cos(jnp.arctan2(q[1], q[0]) - 2 * q[2]) * (q[0] ** 2 + q[1] ** 2)
-
-    found = names(lagjax.System(screw), jnp.array([1.0, 0.3, 0.2]), jnp.array([1.0, 0.5, 0.2]))
+    found = names(SCREW, jnp.array([1.0, 0.3, 0.2]), jnp.array([1.0, 0.5, 0.2]))
     assert found == ["energy", "combination: +0.5 translation of q[2], +1 rotation from q[0] to q[1]"]
     assert names(WAVE, np.ones(2), np.ones(2)) == ["combination: +1 time translation, +1 translation of q[0]"]
 
@@ -166,7 +170,6 @@ KEPLER_BY_FORCE = lagjax.System(lagrangians.free_particles, forces=attract)
 @pytest.mark.slow
 def test_forces_with_a_potential_conserve_what_l_would():
     """Kepler's force, on an orbit whose chords pass the centre: the energy is that of L = T − V but for a constant."""
-
     state = np.array([1.0, 0.0]), np.array([0.0, 1.2])
     found = {c.name: c for c in lagjax.conserved_quantities(KEPLER_BY_FORCE, *state, 1.3)}
     assert list(found) == ["energy", "angular momentum in the plane 01"]
@@ -187,12 +190,15 @@ def test_a_dilation():
     np.testing.assert_allclose(found["dilation"].charge(*state, 2.0), 2.0 * (0.5 * 1.48 + 0.5) - 0.5 * 0.2, rtol=1e-12)
 
 
+LOGARITHM = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.log(q))
+
+
 @pytest.mark.slow
 def test_toda_and_a_damped_oscillator():
     assert names(TODA, np.zeros(3), np.ones(3)) == ["energy", "total momentum", "centre of all coordinates"]
     assert names(DAMPED, 1.0, 0.5) == ["combination: +1 time translation, -0.2 scaling of q"]
     with pytest.raises(ValueError, match="finite at no state"):
-        names(lagjax.System(lambda q, v: 0.5 * v**2 + jnp.log(q)), -5.0, 0.5)
+        names(LOGARITHM, -5.0, 0.5)
 
 
 @pytest.mark.slow

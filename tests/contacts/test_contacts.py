@@ -495,7 +495,9 @@ def test_both_laws_agree_where_all_contacts_press_alike():
 
     def rates_behind(impacts, e):
         balls = lagjax.System(
-            lambda q, v: 0.5 * v @ v, contacts=lambda q: q[1:] - q[:-1], restitution=lambda params: params,
+            lambda q, v: 0.5 * v @ v,
+            contacts=lambda q: q[1:] - q[:-1],
+            restitution=lambda params: params,
             impacts=impacts,
         )  # fmt: skip
         start = jnp.array([-0.5, 0.0, 0.0]), jnp.array([1.0, 0.0, 0.0])

@@ -201,6 +201,9 @@ def test_a_velocity_constraint_is_nonholonomic_and_not_vakonomic():
 # ---- what must not matter --------------------------------------------------------------------------------------------
 
 
+STIFF_ROD = lagjax.System(weight, constraints=lambda q: 1e6 * rod(q)["rod"])
+
+
 @pytest.mark.slow
 def test_doubled_and_scaled_constraints_change_no_motion():
     def many(q):
@@ -208,7 +211,7 @@ def test_doubled_and_scaled_constraints_change_no_motion():
 
     q0, qdot0 = hung(1.2, 0.5)
     ts = np.linspace(0, 2, 3)
-    systems = [WEIGHT_ON_A_ROD, lagjax.System(weight, constraints=lambda q: 1e6 * rod(q)["rod"])]
+    systems = [WEIGHT_ON_A_ROD, STIFF_ROD]
     systems += [lagjax.System(weight, constraints=many, path=path) for path in ("auto", "array")]
     once, scaled, *twice = (lagjax.simulate(system, q0, qdot0, ts, rtol=1e-11) for system in systems)
     for other in (scaled, *twice):
@@ -284,14 +287,18 @@ def test_a_coordinate_without_mass_that_a_constraint_holds():
     np.testing.assert_allclose(HELD_WITHOUT_MASS.acceleration(run.q[1], run.qdot[1]), by_arrays, rtol=1e-13)
 
 
+WITHOUT_MASS = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - q[1], constraints=lambda q: q[0] - 1.0)
+MASSES_AS_PARAMS = lagjax.System(lambda q, v, params: 0.5 * params @ v**2 - q[1], constraints=lambda q: q[0] - 1.0)
+
+
 @pytest.mark.slow
 def test_a_singular_saddle_point_is_reported():
     # Neither L nor the constraint holds q[1]; in the second only because a parameter is zero.
-    system = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - q[1], constraints=lambda q: q[0] - 1.0)
+    system = WITHOUT_MASS
     assert np.isnan(system.acceleration(np.array([1.0, 0.0]), np.zeros(2))).all()
     with pytest.raises(lagjax.SimulationError):
         lagjax.simulate(system, np.array([1.0, 0.0]), np.zeros(2), np.array([0.0, 1.0]))
-    system = lagjax.System(lambda q, v, params: 0.5 * params @ v**2 - q[1], constraints=lambda q: q[0] - 1.0)
+    system = MASSES_AS_PARAMS
     q0, masses = np.array([1.0, 0.0]), np.array([[1.0, 2.0], [0.0, 2.0], [1.0, 0.0]])
     run = lagjax.simulate_batch(system, q0, 0 * q0, np.array([0.0, 1.0]), masses, batch_axes=(None, None, 0))
     assert (run.result == lagjax.RESULTS.mass_matrix_singular).tolist() == [False, False, True]
@@ -433,6 +440,9 @@ def row_alone(a, qdot, params):
     return 0.5 * ((loops + 1) / 3 + loops) * qdot**2 - 9.81 * ((loops + 1) / 2 + loops) * jnp.sin(a)
 
 
+ROW_ALONE = lagjax.System(row_alone)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("loops", [1, 2, 3, 10])
 def test_rows_of_four_bars_pass_flat_configurations(loops):
@@ -441,7 +451,7 @@ def test_rows_of_four_bars_pass_flat_configurations(loops):
     rng = np.random.default_rng(0)
     start = rng.uniform(0.3, 2.8, members)
     rate = rng.uniform(3, 30, members) * rng.choice([-1, 1], members)
-    free = lagjax.simulate_batch(lagjax.System(row_alone), start, rate, ts, {"loops": loops}, rtol=1e-13)
+    free = lagjax.simulate_batch(ROW_ALONE, start, rate, ts, {"loops": loops}, rtol=1e-13)
 
     def joints(x, y):
         return np.stack([f for i in range(loops + 1) for f in (i + x, y)], axis=-1)
@@ -489,15 +499,19 @@ def corners(angle):
 PEAUCELLIER = lagjax.System(peaucellier, constraints=closed_peaucellier)
 
 
+def peaucellier_alone(angle, rate):
+    return peaucellier(*jax.jvp(corners, (angle,), (rate,)))
+
+
+PEAUCELLIER_ALONE = lagjax.System(peaucellier_alone)
+
+
 @pytest.mark.slow
 def test_a_peaucellier_linkage_passes_its_flat_rhombus():
     members, ts, rng = 60, np.linspace(0, 0.3, 4), np.random.default_rng(4)
     start, rate = rng.uniform(-0.9, -0.3, members), rng.uniform(2, 4, members)
 
-    def alone(angle, rate):
-        return peaucellier(*jax.jvp(corners, (angle,), (rate,)))
-
-    free = lagjax.simulate_batch(lagjax.System(alone), start, rate, ts, rtol=1e-13)
+    free = lagjax.simulate_batch(PEAUCELLIER_ALONE, start, rate, ts, rtol=1e-13)
     assert np.mean(free.q[:, -1] > 0) > 0.9
     q0, qdot0 = jax.vmap(lambda angle, rate: jax.jvp(corners, (angle,), (rate,)))(start, rate)
     for rtol in (1e-7, 1e-9, 1e-10):
@@ -581,7 +595,6 @@ SCALED_ROD = lagjax.System(in_units, constraints=lambda q: rod(jnp.stack([q[0] /
 
 
 def test_units_of_constrained_coordinates_do_not_matter():
-
     (q0, qdot0), ts, unit = hung(1.0, 0.5), np.linspace(0, 5, 3), np.array([1e3, 1])
     plain = lagjax.simulate(WEIGHT_ON_A_ROD, q0, qdot0, ts)
     scaled = lagjax.simulate(SCALED_ROD, q0 * unit, qdot0 * unit, ts)

@@ -406,7 +406,6 @@ TWO_BEADS = lagjax.System(
 
 @pytest.mark.slow
 def test_two_beads_rub_as_each_does_alone():
-
     qdot0 = np.array([[3.0, 0.0], [7.0, 0.0]])
     run = lagjax.simulate(TWO_BEADS, np.stack([BOTTOM] * 2), qdot0, np.linspace(0.0, 8.0, 3), 0.3)
     for k in range(2):
@@ -426,7 +425,6 @@ DOUBLE = lagjax.System(
 
 def test_friction_by_one_multiplier_of_two_takes_what_it_works_and_lets_a_joint_rest():
     """A double pendulum of points, whose first rod rubs in its bearing: it stops while the second one swings."""
-
     ts = np.linspace(0.0, 1.0, 2001)
     run = lagjax.simulate(DOUBLE, np.array([[0.0, -1.0], [0.0, -2.0]]), np.array([[0.7, 0.0], [1.4, 0.0]]), ts, 0.1)
     first, rates = np.asarray(run.q)[:, 0], np.asarray(run.qdot)[:, 0]
@@ -447,7 +445,6 @@ LINEAR_LAW = lagjax.System(pendulum, forces=push_by_both_multipliers, constraint
 
 def test_a_law_that_is_linear_in_several_multipliers_needs_no_sign():
     """Against one linear system for accelerations and multipliers."""
-
     phi, rate = 0.4, 2.0
     c, s = LENGTH * np.cos(phi), LENGTH * np.sin(phi)
     q, v = {"x": s, "y": -c, "phi": phi}, {"x": c * rate, "y": s * rate, "phi": rate}
@@ -582,7 +579,6 @@ LIFTED_BLOCK = lagjax.System(lambda q, v: 0.5 * v @ v, forces=lift_and_drag, con
 
 def test_a_normal_force_that_is_read_while_its_contact_opens_and_closes():
     """Lifted by g + (t − 1)(3 − t) it leaves the floor at 1 and falls upon it at 5; impacts bring none."""
-
     ts = jnp.array([0.0, 0.5, 3.0, 6.0])
 
     def run(c):
@@ -609,7 +605,6 @@ STANDING = lagjax.System(
 
 def test_constraints_beside_closed_contacts_have_their_own_multipliers():
     """A mass that stands on a rod, and the rod on a foot which a brake slows: λ is g of the rod, 2 g of the floor."""
-
     run = lagjax.simulate(STANDING, jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([1.0, 0, 1.0, 0]), jnp.array([0.0, 1.0]))
     np.testing.assert_allclose(run.multipliers["rod"], [G, G], rtol=1e-12)
     np.testing.assert_allclose(run.contact_forces["floor"], [2 * G, 2 * G], rtol=1e-12)
@@ -634,7 +629,6 @@ BOX = lagjax.System(lambda q, v: 0.5 * v @ v - G * q[1], forces=rub_box, contact
 @pytest.mark.slow
 def test_normal_forces_of_more_contacts_than_a_body_needs():
     """A box on four corners, of which two touch the floor: their sum is its weight, whichever carries it."""
-
     run = lagjax.simulate(BOX, jnp.array([0.0, 1.0, 0.0]), jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 0.2, 2.0]))
     np.testing.assert_allclose(run.q[1:, 0], [0.2 - 0.004 * G, 1 / (0.4 * G)], rtol=1e-11)
 

@@ -171,7 +171,6 @@ BORDERED = lagjax.System(free_particle, forces=forces_with_borders)
 
 
 def test_explain_names_borders_and_says_whether_they_are_located():
-
     facts = BORDERED.explain(0.0, 1.0)
     assert sorted(facts.borders) == ["the sign of dq", "the sign of t", "the whole part of q"]
     assert facts.narrow == ("a function of t",) and facts.borders_located and "steps end there" in str(facts)

@@ -78,15 +78,20 @@ def test_an_interval_that_does_not_exclude_a_bound_ends_there_and_is_no_power_of
     assert (low == [-1.0, -np.inf]).all() and (high == [3.0, np.inf]).all()
 
 
+def masses(q, qdot, params):
+    return 0.5 * jnp.sum(params["m"] * qdot**2) - 0.5 * jnp.sum(q**2) - 0.5 * params["k"] * (q[0] - q[1]) ** 2
+
+
+MASSES = lagjax.System(masses)
+
+
 def test_numbers_of_an_array_are_free_one_by_one():
     # Two masses that swing apart from each other: a factor of all masses and springs is not seen, and one mass is kept.
-    def masses(q, qdot, params):
-        return 0.5 * jnp.sum(params["m"] * qdot**2) - 0.5 * jnp.sum(q**2) - 0.5 * params["k"] * (q[0] - q[1]) ** 2
 
     truth = {"k": 2.0, "m": np.array([1.5, 0.7])}
-    q = lagjax.simulate(lagjax.System(masses), np.array([1.0, -0.3]), np.zeros(2), TS, truth).q
+    q = lagjax.simulate(MASSES, np.array([1.0, -0.3]), np.zeros(2), TS, truth).q
     fit = lagjax.fit(
-        lagjax.System(masses), lagjax.Record(TS, np.asarray(q)), {"k": 2.0, "m": np.array([1.5, 1.0])},
+        MASSES, lagjax.Record(TS, np.asarray(q)), {"k": 2.0, "m": np.array([1.5, 1.0])},
         free={"k": True, "m": np.array([False, True])}, transforms=lagjax.positive,
     )  # fmt: skip
     assert fit.covariance.names == ("params['k']", "params['m'][1]") and fit.ok

@@ -256,7 +256,6 @@ PUSHED_BEYOND_ZERO = lagjax.System(lagrangians.free_particle, forces=lambda q, v
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", [jax.jacrev, jax.jacfwd])
 def test_at_a_border_derivatives_are_those_before_it_on_both_sides(mode):
-
     def at(q0):
         found = lagjax.crossings(PUSHED_BEYOND_ZERO, position, q0, 0.0, jnp.array([0.0, 3.0]), count=1)
         return jnp.stack([found.t[0], found.qdot[0], found.q[0]])

@@ -364,8 +364,11 @@ def test_sensitivities_of_second_order():
     np.testing.assert_allclose(found, 2 * [of_exact], rtol=1e-8)
 
 
+COUNTED_SPRING = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2)
+
+
 def test_a_call_looks_its_scene_up_once_and_never_remembers_a_number(monkeypatch):
-    scene, asked = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2), []
+    scene, asked = COUNTED_SPRING, []
     kept, derivation_of = [], _problem.derivation_of
     monkeypatch.setattr(_problem, "derivation_of", lambda *args: asked.append(1) or derivation_of(*args))
     ts, start, params = np.linspace(0.0, 2.0, 5), np.array(1.0), {"k": np.array(1.0)}

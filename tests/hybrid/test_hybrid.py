@@ -773,6 +773,9 @@ ROD = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q: q[1])
 MASSLESS = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - q[1] ** 2)
 
 
+WITHOUT_MACHINE_CODE = lagjax.System(lambda q, v: v @ v + jax.scipy.special.betainc(2.0, 3.0, q[0]))
+
+
 @pytest.mark.parametrize(
     ("changes", "error", "sentence"),
     [
@@ -794,7 +797,7 @@ MASSLESS = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - q[1] ** 2)
         ({"ts": [0.0, 2.0, 1.0]}, ValueError, "strictly increasing"),
         ({"q0": np.nan}, ValueError, "q0 is nan"),
         (
-            {"modes": {"a": lagjax.System(lambda q, v: v @ v + jax.scipy.special.betainc(2.0, 3.0, q[0]))},
+            {"modes": {"a": WITHOUT_MACHINE_CODE},
              "q0": np.zeros(2), "qdot0": np.zeros(2), "transitions": [stay(guard=lambda q, v: q[0])]},
             ValueError, "'a' has no machine code: .*regularized_incomplete_beta",
         ),
@@ -980,10 +983,13 @@ def test_derivatives_through_modes_that_differ_by_numbers():
     np.testing.assert_allclose(jax.vmap(at_edges)(many), jax.jit(jax.vmap(exact))(many), rtol=1e-12)
 
 
+ON_A_LINE = lagjax.System(free_particle, constraints=lambda q: q - 2.5)
+
+
 def test_modes_of_a_ladder_keep_their_targets_and_constraints():
     modes = {"0": stair(0), "1": stair(1), "2": stair(2), "3": stair(3)}
     edges = [edge(0, target=2), edge(2, target=3), edge(1, target=0)]
-    modes |= {"line": lagjax.System(free_particle, constraints=lambda q: q - 2.5)}
+    modes |= {"line": ON_A_LINE}
     edges += [edge(3, target="line")]
     edges += [lagjax.Transition("line", "1", lambda q, v: q - 9.0)]  # never: it stands still
     run = hybrid(modes, edges, v0=0.2, ts=(0.0, 1.0, 6.0), params=1.3, rtol=1e-12, throw=False)
@@ -995,12 +1001,15 @@ def test_modes_of_a_ladder_keep_their_targets_and_constraints():
         hybrid(modes, edges, v0=0.2, ts=(0.0, 1.0, 6.0), params=1.3, rtol=1e-12)
 
 
+BALL_ALONE = lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)
+
+
 def test_a_reset_without_machine_code_is_named():
     def shorten(q, v):
         return q, jax.lax.while_loop(lambda v: jnp.abs(v) > 1.0, lambda v: 0.5 * v, -v)
 
     bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=shorten)
-    scene = lagjax.Hybrid({"flight": lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)}, [bounce], "flight")
+    scene = lagjax.Hybrid({"flight": BALL_ALONE}, [bounce], "flight")
     with pytest.raises(ValueError, match=r"with the reset .*shorten.*while"):
         lagjax.simulate(scene, 1.0, 0.0, np.linspace(0.0, 1.0, 3))
 

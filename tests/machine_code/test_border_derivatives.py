@@ -326,7 +326,6 @@ BEAD_ALONE = lagjax.System(lambda x, v: 0.5 * (1 + slope_of_wire(x) ** 2) * v**2
 )
 def test_a_bead_passes_where_the_curvature_of_its_wire_jumps(kind, derivative):
     """As in its one coordinate, where no projection decides by rounding on which side of the border it is."""
-
     wire = lagjax.System(lambda q, v: 0.5 * v @ v - 9.81 * q[1], **{kind: lambda q: q[1] - height_of_wire(q[0])})
 
     def ends(speed, duration):

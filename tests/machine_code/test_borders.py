@@ -228,7 +228,6 @@ def test_what_powers_make_narrow_is_seen_by_guards_and_derivatives(width):
 
 
 def test_an_atom_is_hit_from_any_distance():
-
     def rate(t, y):
         return [*y[2:], *(48 * (y[:2] @ y[:2]) ** -7 - 24 * (y[:2] @ y[:2]) ** -4) * y[:2]]
 

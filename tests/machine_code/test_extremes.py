@@ -39,7 +39,6 @@ DRAGGED = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q[3] ** 2, forces=drag)
 
 
 def test_motions_that_die_out_towards_a_corner():
-
     def end(params, duration):
         return lagjax.simulate(DRAGGED, *start, np.array([0.0, duration]), params)
 

@@ -143,6 +143,9 @@ def test_every_member_may_have_its_own_times_and_parameters(on_the_ptx):
     agree(on_the_ptx(jax.vmap(one), ends, params), jax.jit(jax.vmap(one))(ends, params))
 
 
+VANISHING_MASS = lagjax.System(lambda q, qdot: 0.5 * q * qdot**2 - q)
+
+
 def test_a_failure_has_the_result_of_the_cpu(on_the_ptx):
     scene = scenes.double_pendulum()
 
@@ -150,7 +153,7 @@ def test_a_failure_has_the_result_of_the_cpu(on_the_ptx):
         return motion(scene, q0, 0 * q0, 100.0 * TS, max_steps=9)
 
     def singular(q0):  # a mass that vanishes
-        system = lagjax.System(lambda q, qdot: 0.5 * q * qdot**2 - q)
+        system = VANISHING_MASS
         return motion(system, q0, 0.0)
 
     for run, start in ((spent, scene.q0), (singular, 0.0)):
@@ -262,6 +265,7 @@ def test_gradients_of_motions_that_fail_are_those_of_the_cpu(on_the_ptx, of):
 
 
 FALLING = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
+QUARTIC = lagjax.System(lambda q, v: 0.5 * v**2 - q**4)
 
 
 @pytest.mark.slow
@@ -271,7 +275,7 @@ def test_transposes(on_the_ptx, case):
     derivative, given = {
         "few": (jax.jacrev(lambda q0: motion(pendulum, q0, 0.0)[0][1:3]), (1.0,)),
         "many": (jax.jacrev(lambda q0: motion(pendulum, q0, 0.0)[0]), (1.0,)),
-        "no numbers": (jax.grad(lambda q0: swung(q0, lagjax.System(lambda q, v: 0.5 * v**2 - q**4))), (1.0,)),
+        "no numbers": (jax.grad(lambda q0: swung(q0, QUARTIC)), (1.0,)),
         "borders": (jax.grad(lambda q0: swung(q0, FALLING, 5.0 * TS)), (1.0,)),
         "in memory": (jax.grad(lambda q0, p: swung(q0, chain, params=p), (0, 1)), (chain.q0, chain.params)),
         "own times": (jax.vmap(jax.grad(lambda q0, end: swung(q0, ts=end * TS), (0, 1))), (np.ones(3), ends)),
@@ -336,9 +340,12 @@ def test_derivatives_of_single_precision(on_the_ptx):
     assert on_the_ptx.launches == [3, 3, 3]  # the motion, there and back; and the motion with its tangents
 
 
+WEDGE = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
+
+
 @pytest.mark.slow
 def test_borders_and_events_are_found_in_doubles(on_the_ptx):
-    wedge = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
+    wedge = WEDGE
     wedge = SimpleNamespace(system=wedge, qdot0=0.0, params=None)
 
     def to_event(q0):

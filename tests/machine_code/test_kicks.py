@@ -151,13 +151,16 @@ def test_switched_in_time(what):
     np.testing.assert_allclose(end(lagjax.System(lagrangian), 0.2, 1.0), right, **TIGHT)
 
 
+def switched_field(q, v, t, params):
+    return kinetic(v) + 0.5 * params * jnp.where(t > 1, 1.0, 0.0) * (q[0] * v[1] - q[1] * v[0])
+
+
+SWITCHED_FIELD = lagjax.System(switched_field)
+
+
 def test_field_that_is_switched_on():
     """A charge in the plane: B is switched on by its vector potential ½ B (−y, x), whose jump is a blow by E."""
-
-    def lagrangian(q, v, t, params):
-        return kinetic(v) + 0.5 * params * jnp.where(t > 1, 1.0, 0.0) * (q[0] * v[1] - q[1] * v[0])
-
-    scene, b = lagjax.System(lagrangian), 0.7
+    scene, b = SWITCHED_FIELD, 0.7
 
     def right(b):
         q, v = np.array([0.3, 0.1]) + np.array([1.0, 0.5]), np.array([1.0, 0.5])

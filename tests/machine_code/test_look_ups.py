@@ -223,7 +223,6 @@ ON_A_GRID = lagjax.System(free_particles, forces=force_of_field)
 @pytest.mark.slow
 def test_a_field_on_a_grid():
     """Bilinear between knots of two axes; axes and heights that are not separable, by differences."""
-
     params = {"x": jnp.asarray(KNOTS), "y": jnp.asarray(KNOTS + 0.03), "g": jnp.outer(VALUES, VALUES**2)}
 
     def end(p):
@@ -252,20 +251,24 @@ def test_a_table_of_any_length_is_looked_up(where):
     np.testing.assert_allclose(run.q[-1], 1.2**3 / 6, rtol=1e-12)
 
 
+def chosen_coordinate(q, qdot, params):
+    chosen = q[params["i"]]
+    return 0.5 * jnp.sum(qdot**2) - 0.5 * jnp.sum(chosen**2) - 0.2 * jnp.sum(chosen * q[params["j"]])
+
+
+CHOSEN_COORDINATE = lagjax.System(chosen_coordinate)
+
+
 @pytest.mark.parametrize("place", [0, 2])
 def test_a_coordinate_that_params_choose_is_differentiated_by(place):
     """Σ q[i]² and a product of two such entries: a look-up into the state itself has a slope by what it reads."""
     i, j, q = np.array([place, 1]), np.array([4, 3]), np.array([0.3, -0.7, 1.1, 0.4, -0.2])
 
-    def lagrangian(q, qdot, params):
-        chosen = q[params["i"]]
-        return 0.5 * jnp.sum(qdot**2) - 0.5 * jnp.sum(chosen**2) - 0.2 * jnp.sum(chosen * q[params["j"]])
-
     stiffness = np.zeros((5, 5))
     np.add.at(stiffness, (i, i), 1.0)
     np.add.at(stiffness, (i, j), 0.2)
     np.add.at(stiffness, (j, i), 0.2)
-    scene, params = lagjax.System(lagrangian), {"i": i, "j": j}
+    scene, params = CHOSEN_COORDINATE, {"i": i, "j": j}
     np.testing.assert_allclose(scene.acceleration(q, 0 * q, 0.0, params), -stiffness @ q, rtol=0, atol=1e-15)
     run = lagjax.simulate(scene, q, 0 * q, END, params, solver=MACHINE)
     values, modes = np.linalg.eigh(stiffness)

@@ -346,7 +346,6 @@ def test_steps_of_diffrax_end_at_knots(backward):
 
 @pytest.mark.slow
 def test_interpolation_of_jax_is_known():
-
     def end(values):
         return lagjax.simulate(INTERPOLATED, 0.3, 0.1, END, values, solver=MACHINE).q[-1]
 
@@ -388,7 +387,6 @@ FOLLOWED_BORDER = lagjax.System(oscillator, forces=force_beyond_samples)
 
 @pytest.mark.slow
 def test_a_border_that_follows_samples():
-
     def end(knots, values):
         return lagjax.simulate(FOLLOWED_BORDER, 1.0, 0.0, END, {"t": knots, "u": values}, solver=MACHINE).q[-1]
 

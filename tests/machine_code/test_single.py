@@ -138,14 +138,11 @@ def rod(q):
 
 
 ON_A_ROD = lagjax.System(lagrangians.weight, constraints=rod)
-
-
 FALLS = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) + 1.0 / jnp.sqrt(jnp.sum(q**2)))
 
 
 @pytest.mark.slow
 def test_constraints_and_failures(off):
-
     run = lagjax.simulate(ON_A_ROD, np.float32([0.6, -0.8]), np.zeros(2, np.float32), TS)
     assert np.abs(run.constraint_residual()).max() <= 2 * EPS and run.multipliers.dtype == np.float32
     with pytest.raises(lagjax.SimulationError, match=r"beyond t = 1\.11072"):  # π/√8
@@ -353,19 +350,20 @@ def test_a_motion_that_starts_on_a_border_of_its_force(off, place):
 
 
 ATOM = lagjax.System(lambda q, v: 0.5e-46 * v**2 - 0.5e-46 * q**2)
-
-
 HEAVY_BEAD = lagjax.System(lambda q, v: 0.5e24 * v @ v - 1e21 * q[0], constraints=lambda q: jnp.sum(q**4) - 1.5e11**4)
+
+
+def gravity_in_si(q, v, params):
+    of = 0.5 * jnp.array([1.989e30, 5.97e24]) @ jnp.sum(v**2, 1)
+    return of + params * 1.989e30 * 5.97e24 / jnp.sqrt(jnp.sum((q[1] - q[0]) ** 2))
+
+
+PLANETS = lagjax.System(gravity_in_si)
 
 
 def test_planets_and_atoms_in_si_units(off):
     """Masses whose product is 1e55, and constants of 1e-46: every quantity is computed in float64."""
-
-    def gravity(q, v, params):
-        of = 0.5 * jnp.array([1.989e30, 5.97e24]) @ jnp.sum(v**2, 1)
-        return of + params * 1.989e30 * 5.97e24 / jnp.sqrt(jnp.sum((q[1] - q[0]) ** 2))
-
-    system, q, v = lagjax.System(gravity), jnp.array([[0.0, 0], [1.496e11, 0]]), jnp.array([[0.0, 0], [0, 29780.0]])
+    system, q, v = PLANETS, jnp.array([[0.0, 0], [1.496e11, 0]]), jnp.array([[0.0, 0], [0, 29780.0]])
     pull = 6.674e-11 * 1.989e30 / 1.496e11**2
     energy = 0.5 * 5.97e24 * 29780**2 - pull * 1.496e11 * 5.97e24
     for at in (lambda name: getattr(system, name), lambda name: jax.jit(getattr(system, name))):
@@ -474,6 +472,9 @@ def test_a_new_value_compiles_nothing(off):
 # ---- what is done with motions ---------------------------------------------------------------------------------------
 
 
+DOUBLED_BALL = lagjax.System(lambda q, v: v**2 - 2 * 9.81 * q)
+
+
 def test_what_a_scene_does(off):
     params = {"m": 1.0, "l": LENGTH}
     rest = lagjax.equilibrium(SCENE, 0.3, params)
@@ -483,7 +484,7 @@ def test_what_a_scene_does(off):
     kepler = KEPLER
     found = lagjax.conserved_quantities(kepler, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.2]))
     assert [charge.name for charge in found] == ["energy", "angular momentum in the plane 01"]
-    assert lagjax.same_motion(BALL, lagjax.System(lambda q, v: v**2 - 2 * 9.81 * q), 0.0, 1.0).same
+    assert lagjax.same_motion(BALL, DOUBLED_BALL, 0.0, 1.0).same
 
 
 @pytest.mark.slow

@@ -60,7 +60,6 @@ MASS_BY_SPEED = lagjax.System(
 
 
 def test_a_block_whose_mass_depends_on_its_speed_rests_where_its_energy_is_spent():
-
     def end(mu):
         return lagjax.simulate(MASS_BY_SPEED, 1.0, 0.0, np.array([0.0, 20.0]), mu).q[-1]
 
@@ -376,7 +375,6 @@ def test_derivatives_along_borders_of_every_kind():
 
 @pytest.mark.parametrize("count", [2, pytest.param(10, marks=pytest.mark.slow)])
 def test_borders_that_are_come_to_at_one_instant_each_shift_their_own_tangents(count):
-
     def ends(v0):
         return lagjax.simulate(STAIRS_OF_SPEEDS, jnp.zeros(count), v0, jnp.array([0.0, 2.0]), 1.5).q[-1]
 

@@ -264,4 +264,4 @@ def test_systems_in_tests_are_shared():
             if isinstance(test, ast.FunctionDef) and test.name.startswith("test_"):
                 calls = [node for node in ast.walk(test) if isinstance(node, ast.Call)]
                 built += sum(ast.unparse(call.func).endswith("System") for call in calls)
-    assert built <= 343
+    assert built <= 210

@@ -287,18 +287,22 @@ def test_members_do_not_depend_on_their_neighbours(tmp_path, undisturbed, unit):
     np.testing.assert_array_equal(run.open().fastest, swept(whole).open().fastest)
 
 
+def heavier(q, qdot, params):
+    return 0.5 * params**2 * qdot**2 + 2 * GRAVITY * params * jnp.cos(q)
+
+
+HEAVIER = lagjax.System(heavier)
+
+
 def test_changed_descriptions_are_refused_with_the_difference(tmp_path, undisturbed):
     swept(tmp_path)
-
-    def heavier(q, qdot, params):
-        return 0.5 * params**2 * qdot**2 + 2 * GRAVITY * params * jnp.cos(q)
 
     def by_constant(gravity):
         return lagjax.System(lambda q, qdot, params: 0.5 * params**2 * qdot**2 + gravity * params * jnp.cos(q))
 
     common = {**RULE, "store": tmp_path / "store"}
     with pytest.raises(ValueError, match=r"(?s)another description.*\+.*2 \* GRAVITY \* params"):
-        run_sweep(lagjax.System(heavier), OVER, TS, **common)
+        run_sweep(HEAVIER, OVER, TS, **common)
     with pytest.raises(ValueError, match=r"length.*angle.*in the store, now"):
         swept(tmp_path, OVER | {"angle": np.linspace(0.0, 3.0, 8)})
     with pytest.raises(ValueError, match="rtol: None in the store, now 1e-06"):
@@ -330,11 +334,14 @@ def outwards(q, qdot, params):  # q¨ = 1 where nothing pulls; a collision where
     return 0.5 * qdot**2 + q + params["pull"] / q - 0.5 * params["k"] * q**2
 
 
+OUTWARDS = lagjax.System(outwards)
+
+
 def test_failures_cost_the_others_nothing(tmp_path):
     start, pull, k = 1.0 + np.arange(300) / 300, np.zeros(300), np.zeros(300)
     start[5], pull[[20, 150]], k[77] = -1.0, 9.0, 1e12
     over = {("start", "pull", "k"): (start, pull, k)}
-    system, of = lagjax.System(outwards), lambda point: {"pull": point["pull"], "k": point["k"]}
+    system, of = OUTWARDS, lambda point: {"pull": point["pull"], "k": point["k"]}
     q0 = lambda point: jnp.where(point["start"] < 0, jnp.nan, point["start"])
     rule = {**RULE, "store": tmp_path / "store", "q0": q0, "params": of, "unit": 70, "max_steps": 300}
     told = run_sweep(system, over, TS, **rule).status()
@@ -854,6 +861,9 @@ def test_example(tmp_path, monkeypatch):
     assert 0 < np.isfinite(flip).sum() < flip.size
 
 
+PENDULUM_ALONE = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
+
+
 def test_the_first_look_finds_a_type_for_all_members(tmp_path):
     """1 of one member and 1.5 of another are floats: `keep` in plain Python, called member by member."""
 
@@ -861,7 +871,7 @@ def test_the_first_look_finds_a_type_for_all_members(tmp_path):
         fastest = float(np.abs(trajectory.qdot).max())
         return {"speed": 1 if fastest < 0.5 else 1.5, "count": len(trajectory.ts)}
 
-    pendulum = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
+    pendulum = PENDULUM_ALONE
     angles = np.array([0.1, 0.2, 1.0, 2.0])
     swept = run_sweep(
         pendulum, {"angle": angles}, jnp.linspace(0.0, 5.0, 6), q0=lambda p: p["angle"], qdot0=0.0, keep=keep,
