@@ -367,7 +367,7 @@ def test_gradients_come_to_the_same_as_gauss_and_newton():
     assert "came to rest" in fit.message
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # takes half a minute: the one fit of a network, to all of the example's nine records
 def test_a_network_learns_the_potential_of_its_recordings():
     example = importlib.import_module("learned_potential")
     values, exact, starts = example.recordings()
