@@ -305,7 +305,7 @@ def test_a_long_record_is_found_from_any_frequency_where_whole_records_fail():
     [record] = records(1, ts, params=TRUTH | {"c": 0.0}, known=True)
     record = lagjax.Record(ts, record.values)
     free = FREE | {"c": False}
-    for first in (0.01, 0.1, 30.0, 1000.0):  # of a length of 0.7: frequencies from 0.1 to 30 rad per unit of time
+    for first in (0.01, 1000.0):  # of a length of 0.7: frequencies from 0.1 to 30 rad per unit of time
         start = TRUTH | {"c": 0.0, "l": first}
         fit = lagjax.fit(SCENE, record, start, free=free, transforms=lagjax.positive)
         assert fit.rms["q"] < 1.1 * SIGMA and abs(fit.params["l"] - 0.7) < 1e-3, first
@@ -632,31 +632,33 @@ def test_with_nothing_free_starts_and_noise_are_fitted():
         fit.profile("k")
 
 
+SPRINGS = lagjax.System(
+    lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["p"][0] * q**2 + params["p"][2] * q,
+    forces=lambda q, qdot, params: -params["p"][1] * qdot,
+)
+
+
 def test_transforms_by_element():
-    scene = lagjax.System(
-        lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["p"][0] * q**2 + params["p"][2] * q,
-        forces=lambda q, qdot, params: -params["p"][1] * qdot,
-    )
     record, p0 = decaying(1.0, 0), np.array([3.5, 0.1, -0.05])
     each = np.array([lagjax.positive, lagjax.positive, None])
-    fit = lagjax.fit(scene, record, {"p": p0}, transforms={"p": each})
+    fit = lagjax.fit(SPRINGS, record, {"p": p0}, transforms={"p": each})
     np.testing.assert_allclose(fit.params["p"], [4.0, 0.2, 0.0], atol=0.02)
     low, high = (end["p"] for end in fit.intervals(0.95))
     assert (low[:2] > 0).all() and low[2] < 0.0 < high[2]
     assert low[0] * high[0] == pytest.approx(float(fit.params["p"][0]) ** 2)  # relative, where it is positive
     assert 0.5 * (low[2] + high[2]) == pytest.approx(float(fit.params["p"][2]))
-    kept = lagjax.fit(scene, record, {"p": p0}, transforms={"p": each}, free={"p": np.array([True, False, True])})
+    kept = lagjax.fit(SPRINGS, record, {"p": p0}, transforms={"p": each}, free={"p": np.array([True, False, True])})
     assert kept.params["p"][1] == 0.1 and kept.params["p"][0] > 0
     with pytest.raises(
         ValueError, match=r"transforms must hold one for params\['p'\], or an array .* of its shape \(3,\)"
     ):
-        lagjax.fit(scene, record, {"p": p0}, transforms={"p": each[:2]})
+        lagjax.fit(SPRINGS, record, {"p": p0}, transforms={"p": each[:2]})
     with pytest.raises(ValueError, match=r"params\['p'\] must start above zero"):
-        lagjax.fit(scene, record, {"p": p0}, transforms={"p": each[[0, 2, 1]]})
+        lagjax.fit(SPRINGS, record, {"p": p0}, transforms={"p": each[[0, 2, 1]]})
     with pytest.raises(ValueError, match=r"params\['p'\] is free as a whole or not at all"):
-        lagjax.fit(scene, record, {"p": p0}, transforms={"p": np.array([lagjax.simplex, None, None])})
+        lagjax.fit(SPRINGS, record, {"p": p0}, transforms={"p": np.array([lagjax.simplex, None, None])})
     with pytest.raises(TypeError, match=r"transforms must hold lagjax\.positive"):
-        lagjax.fit(scene, record, {"p": p0}, transforms={"p": np.array([1.0, 2.0, 3.0])})
+        lagjax.fit(SPRINGS, record, {"p": p0}, transforms={"p": np.array([1.0, 2.0, 3.0])})
 
 
 @pytest.mark.slow
