@@ -126,18 +126,20 @@ def test_the_message_tells_what_it_ran_into(name):
         lagjax.simulate(lagjax.System(lagrangian, forces=forces), q0, qdot0, TS, **more)
 
 
+POLES = (
+    lagjax.System(lambda q, v: 0.5 * v**2 + 1 / q**3),
+    lagjax.System(lambda q, v: 0.5 * v**2 + 1 / q**3),
+)
+KINKS = (
+    lagjax.System(lambda q, v: 0.5 * v**2 - jnp.abs(q - 3.0)),
+    lagjax.System(lambda q, v: 0.5 * v**2 - jnp.abs(q - 3.0)),
+)
+
+
 def test_scenes_of_one_text_are_told_their_own_lines():
     """They are derived once; the line is that of the functions of each."""
-    scenes = (
-        lagjax.System(lambda q, v: 0.5 * v**2 + 1 / q**3),
-        lagjax.System(lambda q, v: 0.5 * v**2 + 1 / q**3),
-    )
-    kinks = (
-        lagjax.System(lambda q, v: 0.5 * v**2 - jnp.abs(q - 3.0)),
-        lagjax.System(lambda q, v: 0.5 * v**2 - jnp.abs(q - 3.0)),
-    )
     lines = []
-    for scene, kink in zip(scenes, kinks, strict=True):
+    for scene, kink in zip(POLES, KINKS, strict=True):
         with pytest.raises(lagjax.SimulationError) as stopped:
             lagjax.simulate(scene, 1.0, 0.0, TS)
         with pytest.raises(ValueError, match="is on a border") as rough:
