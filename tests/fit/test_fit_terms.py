@@ -31,13 +31,25 @@ def potential(candidates):
     return law, lagjax.System(lambda q, v, params: 0.5 * v**2 - law(q, params=params))
 
 
-def spring_with_friction(candidates=DRAG):
-    law = lagjax.terms(candidates)
-    scene = lagjax.System(
-        lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2,
-        forces=lambda q, v, params: law(v, params=params["friction"]),
-    )
-    return law, scene
+FRICTION = lagjax.terms(DRAG)
+SPRING = lagjax.System(
+    lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2,
+    forces=lambda q, v, params: FRICTION(v, params=params["friction"]),
+)
+DUFFING = lagjax.System(lambda q, v, params: 0.5 * v**2 - params[0] * q**2 / 2 - params[1] * q**4 / 4)
+BINOMIAL = lagjax.terms({"a": POWERS["q2"], "b": POWERS["q4"]})
+TIMED = lagjax.terms({"a": lambda v, t: -v, "c": lambda v, t: -v * jnp.abs(v)})
+PAIR = lagjax.System(
+    lambda q, v, params: 0.5 * v**2 - BINOMIAL(q, params=params["laws"][0]),
+    forces=lambda q, v, t, params: TIMED(v, t=t, params=params["laws"][1]),
+)
+TWENTY = lagjax.terms(
+    {f"q{k}": lambda q, k=k: q**k / k for k in range(1, 11)}
+    | {f"cos{k}": lambda q, k=k: jnp.cos(k * q) / k for k in range(1, 11)}
+)
+DRIVEN = lagjax.System(
+    lambda q, v, params: 0.5 * v**2 - TWENTY(q, params=params), forces=lambda q, v, t: 0.5 * jnp.cos(1.3 * t)
+)
 
 
 def record(scene, q0, params, seed=0, ts=TS, scatter=1e-3):
@@ -66,7 +78,7 @@ def test_a_potential_is_found_among_powers_and_cosine(numbers):
 
 
 def test_friction_is_found():
-    law, scene = spring_with_friction()
+    law, scene = FRICTION, SPRING
     true = {"k": 4.0, "friction": law.params0 | {"coulomb": 0.05, "viscous": 0.1}}
     records = [record(scene, q0, true, seed) for seed, q0 in enumerate((1.0, 2.0, 1.5))]
     begun = {"k": 3.0, "friction": law.params0 | dict.fromkeys(DRAG, 0.02)}
@@ -77,7 +89,7 @@ def test_friction_is_found():
 
 
 def test_no_term_is_kept_where_none_is_needed():
-    law, scene = spring_with_friction()
+    law, scene = FRICTION, SPRING
     true = {"k": 4.0, "friction": law.params0}
     fit = lagjax.fit(scene, record(scene, 1.0, true), {"k": 3.0, "friction": law.params0})
     assert fit.ok and fit.selection.kept == () and not any(fit.params["friction"].values())
@@ -103,14 +115,7 @@ def test_terms_that_a_small_swing_cannot_tell_apart_are_named():
 
 
 def test_two_laws_and_terms_of_the_same_name():
-    law, drag = (
-        lagjax.terms({"a": POWERS["q2"], "b": POWERS["q4"]}),
-        lagjax.terms({"a": lambda v, t: -v, "c": lambda v, t: -v * jnp.abs(v)}),
-    )
-    scene = lagjax.System(
-        lambda q, v, params: 0.5 * v**2 - law(q, params=params["laws"][0]),
-        forces=lambda q, v, t, params: drag(v, t=t, params=params["laws"][1]),
-    )
+    law, drag, scene = BINOMIAL, TIMED, PAIR
     true = {"laws": (law.params0 | {"a": 1.0, "b": 0.5}, drag.params0 | {"a": 0.1})}
     fit = lagjax.fit(scene, record(scene, 1.2, true), {"laws": (law.params0, drag.params0)})
     assert fit.ok and set(fit.selection.kept) == {"params['laws'][0]['a']", "b", "params['laws'][1]['a']"}, fit
@@ -128,14 +133,8 @@ def test_numbers_that_stay_and_other_branches():
 
 
 def test_twenty_terms_of_a_driven_motion():
-    names = {f"q{k}": lambda q, k=k: q**k / k for k in range(1, 11)}
-    names |= {f"cos{k}": lambda q, k=k: jnp.cos(k * q) / k for k in range(1, 11)}
-    law = lagjax.terms(names)
-    scene = lagjax.System(
-        lambda q, v, params: 0.5 * v**2 - law(q, params=params), forces=lambda q, v, t: 0.5 * jnp.cos(1.3 * t)
-    )
-    true = law.params0 | {"q2": 1.0, "q4": 0.5}
-    assert_truth(lagjax.fit(scene, record(scene, 1.2, true, ts=np.linspace(0.0, 30.0, 1001)), law.params0), true)
+    true = TWENTY.params0 | {"q2": 1.0, "q4": 0.5}
+    assert_truth(lagjax.fit(DRIVEN, record(DRIVEN, 1.2, true, ts=np.linspace(0.0, 30.0, 1001)), TWENTY.params0), true)
 
 
 def test_a_law_of_a_dict_and_of_arrays():
@@ -155,7 +154,7 @@ def test_a_scene_with_a_law_goes_through_transformations():
     params = law.params0 | {"q2": 1.0, "q4": 0.5}
     end = lambda params: lagjax.simulate(scene, 1.0, 0.0, np.array([0.0, 1.0]), params).q[-1]
     by_hand = lambda k, l: lagjax.simulate(
-        lagjax.System(lambda q, v, params: 0.5 * v**2 - params[0] * q**2 / 2 - params[1] * q**4 / 4),
+        DUFFING,
         1.0,
         0.0,
         [0.0, 1.0],
