@@ -2,7 +2,6 @@
 
     python -m benchmarks.fit_population --fits 97 --sensors 60 --honest 30
     python -m benchmarks.fit_population --fits 0 --sensors 60 --honest 10 --float32
-    python -m benchmarks.fit_population --fits 0 --sensors 0 --honest 0 --coverage 100
 
 A pendulum with friction, a double pendulum, a cart with a pole, Duffing's oscillator and two masses on springs, three
 records each, and one mistake in the data: angles modulo 2π, degrees, milliseconds, swapped signals, a constant signal,
@@ -17,10 +16,6 @@ samples missing and written as 0.0, −9999 or 1e6, values rounded, rounded to 2
 - *wrong* where the fit is ok and a parameter is not right; a *crash* is an error that is no sentence.
 
 Honest fits, with no mistake, are the control: one that is not ok is an *alarm*.
-
-`--coverage` counts how often 95 % intervals hold the truth, of fits that are not told what the sensor does: a motor
-with dry friction and an encoder of 2.5 mrad, driven for 3 s of 4 and then at rest; a pendulum whose sensor ends at ±0.8
-of ±1.2; one with an encoder of 24 lines and a swing of 0.4 rad, without and with noise.
 """
 
 import argparse
@@ -229,70 +224,16 @@ def schedule(fits: int, honest: int, sensors: int = 0) -> list[tuple[int, str, s
     return rows + [(10_000 + seed, list(CASES)[seed % len(CASES)], None) for seed in range(honest)]
 
 
-MOTOR = lagjax.System(
-    lambda q, v: 0.5 * v**2,
-    forces=lambda q, v, params, inputs: params["K"] * inputs - params["B"] * v - params["F"] * jnp.sign(v),
-)
-PENDULUM = lagjax.System(
-    lambda q, v, params: 0.5 * v**2 + params["w2"] * jnp.cos(q),
-    dissipation=lambda q, v, params: 0.5 * params["c"] * v**2,
-)
-
-
-def motor_record(rng) -> lagjax.Record:
-    """A square wave for 3 s of 4, then rest, seen by an encoder."""
-    ts, truth, step = np.linspace(0.0, 4.0, 2000), {"K": 8.0, "B": 1.5, "F": 2.0}, 2.5e-3
-    driven = np.where(ts < 3.0, rng.uniform(1.5, 3.0) * np.sign(np.sin(2 * np.pi * ts / 0.8 + rng.uniform(0, 6))), 0.0)
-    record = lagjax.Record(ts, np.zeros(2000), inputs=driven, start=(0.0, rng.uniform(-1, 1)))
-    kept = lagjax.fit(MOTOR, record, truth, free=False)  # the motion of the truth, with the inputs of the record
-    return lagjax.Record(ts, _round(np.asarray(kept.residuals[0]), step, rng.random()), inputs=driven)
-
-
-def pendulum_record(rng, size: float, sensor: Callable[[np.ndarray], np.ndarray], sigma: float) -> lagjax.Record:
-    """A swing of about this size, seen by a sensor."""
-    ts, size, phase = np.linspace(0.0, 12.0, 601), size * rng.uniform(0.95, 1.05), rng.uniform(0, 2 * np.pi)
-    q = lagjax.simulate(PENDULUM, size * np.cos(phase), 3 * size * np.sin(phase), ts, {"w2": 9.0, "c": 0.1}).q
-    return lagjax.Record(ts, sensor(np.asarray(q) + sigma * rng.normal(size=601)))
-
-
-def coverage(draws: int) -> dict[str, dict[str, float]]:
-    """Of each sensor and parameter the share of 95 % intervals that hold the truth."""
-    lines = 2 * np.pi / 24
-    kinds = {
-        "motor, encoder": (MOTOR, {"K": 8.0, "B": 1.5, "F": 2.0}, motor_record),
-        "clipped": (PENDULUM, {"w2": 9.0, "c": 0.1},
-                    lambda rng: pendulum_record(rng, 1.2, lambda x: np.clip(x, -0.8, 0.8), 5e-3)),
-        "24 lines": (PENDULUM, {"w2": 9.0, "c": 0.1},
-                     lambda rng: pendulum_record(rng, 0.4, lambda x: _round(x, lines, rng.random()), 0.0)),
-        "24 lines, noise": (PENDULUM, {"w2": 9.0, "c": 0.1},
-                            lambda rng: pendulum_record(rng, 0.4, lambda x: _round(x, lines, rng.random()), 0.08)),
-    }  # fmt: skip
-    shares = {}
-    for kind, (system, truth, record) in kinds.items():
-        held = []
-        for seed in range(draws):
-            begin = {k: 1.1 * x for k, x in truth.items()}
-            fit = lagjax.fit(system, record(np.random.default_rng(seed)), begin, transforms=lagjax.positive)
-            low, high = fit.intervals()
-            held.append([low[k] <= x <= high[k] or not fit.ok for k, x in truth.items()])
-        shares[kind] = dict(zip(truth, np.mean(held, axis=0).round(3).tolist(), strict=True))
-        print(f"{kind:<16} of {draws} intervals of 95 % hold the truth: {shares[kind]}", flush=True)
-    return shares
-
-
 def main(argv=None) -> dict[str, Any]:
     """Run the population, print what is wrong, told or an alarm, and return the counts by mistake."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--fits", type=int, default=100, help="fits with a mistake")
     parser.add_argument("--sensors", type=int, default=0, help="fits with what sensors do to numbers")
-    parser.add_argument("--coverage", type=int, default=0, help="fits of each sensor whose intervals are counted")
     parser.add_argument("--float32", action="store_true", help="records in float32, without JAX's switch")
     parser.add_argument("--honest", type=int, default=30, help="fits without one")
     parser.add_argument("--only", type=int, nargs="*", help="seeds to run alone, with all that they say")
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", not options.float32)
-    if options.coverage:
-        coverage(options.coverage)
     counts: dict[str, collections.Counter] = collections.defaultdict(collections.Counter)
     for seed, scene, mistake in schedule(options.fits, options.honest, options.sensors):
         if options.only and seed not in options.only:

@@ -10,14 +10,13 @@ gain (Rhoban/bam; the keys are `K_timestamp`, `K_position`, `K_goal_position`, `
 `sag` is what the supply loses under load. The teeth of a gear box press on each other with the motor's torque on one
 side, and the weight on the other, and friction grows with both:
 
-    friction = (dry + a |τ| + b |m g l sin(q + offset)|) (1 + rise exp(−(q̇/slow)²)) + viscous |q̇|
+    friction = dry + viscous |q̇| + (a |τ| + b |m g l sin(q + offset)| + c) (1, or exp(−(q̇/slow)²))
 
-Which of these terms the servo has is chosen by what the law is for: half of the recordings is left out, the law is
-fitted to the other half, and what was left out is simulated from its first sample, with its goal alone; then the halves
-change places. Of the laws that follow as well as the best, within one standard error of the difference over all
-recordings, the simplest is taken.
+Which of these terms the servo has, and whether its supply sags, is chosen by `lagjax.terms`: a fit has all of them,
+others have fewer and fewer, recordings are left out and simulated with what the others gave, and of the laws that
+follow as well as the best, within one standard error of the difference over all recordings, the smallest is taken.
 
-    python examples/servo.py servo_identification.npz [--law "load, sag"] [--follow OTHER.npz]
+    python examples/servo.py servo_identification.npz [--follow OTHER.npz]
 """
 
 import argparse
@@ -36,25 +35,33 @@ DUTY = 4096 / (2 * np.pi) / (256 * 885)  # duty cycle over gain and error [1/rad
 SLOW = 0.5  # rad/s within which dry friction falls
 SPACING = 0.02  # seconds between positions that are fitted
 
+
+def against(size):
+    """A term of friction: against the velocity, as large as `size` of the motor's torque, the weight and the rise."""
+    return lambda v, torque, weight: -jnp.sign(v) * size(jnp.abs(torque), jnp.abs(weight), jnp.exp(-((v / SLOW) ** 2)))
+
+
+FRICTION = lagjax.terms({
+    "viscous": lambda v, torque, weight: -v,
+    "motor": against(lambda motor, weight, rise: motor),
+    "weight": against(lambda motor, weight, rise: weight),
+    "rise": against(lambda motor, weight, rise: rise),
+    "rise by motor": against(lambda motor, weight, rise: motor * rise),
+    "rise by weight": against(lambda motor, weight, rise: weight * rise),
+})  # fmt: skip
+SUPPLY = lagjax.terms({"sag": lambda duty: -duty * jnp.abs(duty)})
 START = {"pull": 1.0, "brake": 0.04, "armature": 1.5e-3, "offset": 0.0, "dry": 0.02}
-MORE = {"viscous": 0.01, "motor": 0.25, "weight": 0.15, "sag": 0.3, "rise": 0.3}
-LAWS = {
-    "dry and viscous": ("viscous",),
-    "load": ("motor", "weight"),
-    "load, sag": ("motor", "weight", "sag"),
-    "load, sag, rise": ("motor", "weight", "sag", "rise"),
-    "load, sag, rise, viscous": ("motor", "weight", "sag", "rise", "viscous"),
-}
+START |= {"friction": FRICTION.params0 | {"motor": 0.25, "weight": 0.15}, "supply": SUPPLY.params0}
+SETS = dict.fromkeys(("pull", "brake", "armature", "dry"), lagjax.positive)
+SETS |= dict.fromkeys(("offset", "friction", "supply"), None)
 
 
 def push(q, qdot, params, inputs, weight):
     """The motor's torque less friction [N m]."""
     duty = jnp.clip(inputs["gain"] * (inputs["goal"] - q), -1.0, 1.0)
-    torque = params["pull"] * duty * (1 - params["sag"] * jnp.abs(duty)) - params["brake"] * qdot
-    torque = inputs["on"] * torque
-    load = params["motor"] * jnp.abs(torque) + params["weight"] * jnp.abs(weight * jnp.sin(q + params["offset"]))
-    dry = (params["dry"] + load) * (1 + params["rise"] * jnp.exp(-((qdot / SLOW) ** 2)))
-    return torque - dry * jnp.sign(qdot) - params["viscous"] * qdot
+    torque = params["pull"] * (duty + SUPPLY(duty, params=params["supply"])) - params["brake"] * qdot
+    torque, weight = inputs["on"] * torque, weight * jnp.sin(q + params["offset"])
+    return torque - params["dry"] * jnp.sign(qdot) + FRICTION(qdot, torque, weight, params=params["friction"])
 
 
 class Recording(NamedTuple):
@@ -121,49 +128,16 @@ def recordings(file) -> list[Recording]:
     return found
 
 
-def fit_law(known: list[Recording], more, near=None) -> lagjax.results.Fit:
-    """The fit of one law, begun at the parameters of the fit `near`; terms that it does not name are zero."""
-    first = START | dict.fromkeys(MORE, 0.0) | {name: MORE[name] for name in more}
-    first = first if near is None else near.params
-    free = {name: name in START or name in more for name in first}
-    transforms = {name: lagjax.positive if free[name] and name != "offset" else None for name in first}
+def fit_servo(known: list[Recording]) -> lagjax.results.Fit:
+    """The fit of recordings, and its choice of terms."""
     arms = {one.arm: one.scene() for one in known}
     records = {arm: [one.record() for one in known if one.arm == arm] for arm in arms}
-    return lagjax.fit(arms, records, first, free=free, transforms=transforms, method="whole")
+    return lagjax.fit(arms, records, START, transforms=SETS, method="whole")
 
 
 def mean_error(params, one: Recording) -> float:
     """The mean absolute error [mrad] of a simulated recording."""
     return 1e3 * float(np.mean(np.abs(one.errors(params))))
-
-
-def left_out(known: list[Recording], more, near) -> list[float]:
-    """The errors of each half, by a law that is fitted to the other half."""
-    errors = np.zeros(len(known))
-    for half in (0, 1):
-        fit = fit_law([one for k, one in enumerate(known) if k % 2 != half], more, near)
-        for k in range(half, len(known), 2):
-            errors[k] = mean_error(fit.params, known[k])
-    return errors.tolist()
-
-
-def chosen(free: list[int], errors: np.ndarray) -> int:
-    """Which law (of errors (laws, recordings)): the simplest within one standard error of the best."""
-    behind = errors - errors[np.argmin(errors.mean(axis=1))]
-    mean, error = behind.mean(axis=1), behind.std(axis=1, ddof=1) / np.sqrt(errors.shape[1])
-    return min(np.flatnonzero(mean <= error).tolist(), key=lambda k: (free[k], mean[k]))
-
-
-def select(known: list[Recording], fits: dict) -> str:
-    """The name of the law that follows what was left out, and the table it was read off."""
-    errors = np.array([left_out(known, LAWS[name], fit) for name, fit in fits.items()])
-    free = [len(fit.u) for fit in fits.values()]
-    print(f"{'law':<34}free  mean  mean absolute error [mrad] of each recording, left out")
-    for name, count, row in zip(fits, free, errors, strict=True):
-        print(f"{name:<34}{count:>4}{row.mean():6.1f}  " + "".join(f"{x:6.0f}" for x in row))
-    name = list(fits)[chosen(free, errors)]
-    print(f"No simpler law follows as well as the best, within one standard error: {name}.\n")
-    return name
 
 
 def draw(known: list[Recording], params, file: Path):
@@ -188,27 +162,22 @@ def draw(known: list[Recording], params, file: Path):
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", type=Path, help="the recordings, an .npz file")
-    parser.add_argument("--law", choices=LAWS, help="take this law without looking at the others")
     parser.add_argument("--follow", type=Path, help="other recordings of the servo, simulated with what was fitted")
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
     plt.style.use("lagjax.figures")
 
-    known, fits = recordings(options.file), {}
-    for name, more in LAWS.items():
-        if options.law in (None, name):
-            fits[name] = fit_law(known, more)
-    name = options.law or select(known, fits)
-    params = fits[name].params
-    print(f"{name}\n{fits[name]}\n")
+    known = recordings(options.file)
+    fit = fit_servo(known)
+    print(f"{fit}\n")
     errors = {}
     for file, text in ((options.file, "fitted"), (options.follow, "followed")):
         if file is not None:
             other = recordings(file)
-            draw(other, params, Path("out") / f"servo_{text}.png")
-            errors[text] = [mean_error(params, one) for one in other]
+            draw(other, fit.params, Path("out") / f"servo_{text}.png")
+            errors[text] = [mean_error(fit.params, one) for one in other]
             print(f"{text}: {len(other)} recordings, mean absolute error {np.mean(errors[text]):.1f} mrad")
-    return fits, name, errors
+    return fit, errors
 
 
 if __name__ == "__main__":

@@ -42,6 +42,7 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 - `Record`, `Timings`, `Guess`, `Delayed`, `wrapped`: what was measured, and how
 - `Gaussian`, `StudentT`, `Quantised`, `Clipped`: the noise
 - `positive`, `between`, `angle`, `simplex`, `inertia`: what parameters may be; `per_record`: one value a record
+- `terms`: a law of candidate terms, of which `fit` keeps those that the motion asks for
 
 **Many members, few numbers of each**
 
@@ -108,6 +109,7 @@ if TYPE_CHECKING:  # each is imported on first use: all of them take as long as 
         per_record,
         positive,
         simplex,
+        terms,
         wrapped,
     )
     from lagjax._interface import RESULTS, SimulationError
@@ -127,7 +129,7 @@ __all__ = [
     "designs", "equilibrium", "family", "find_path", "fit", "hamiltonian", "inertia", "inverse_dynamics", "linearize",
     "lyapunov_exponent", "lyapunov_spectrum", "noether_charge", "normal_modes", "per_record", "periodic_orbit", "plot",
     "positive", "results", "routhian", "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch",
-    "steady_motion", "sweep", "work_precision", "wrapped",
+    "steady_motion", "sweep", "terms", "work_precision", "wrapped",
 ]  # fmt: skip
 
 

@@ -33,7 +33,7 @@ from lagjax._analysis import (
     SteadyMotion,
 )
 from lagjax._analysis.orbits import Family, LyapunovExponent, Orbit, Path
-from lagjax._fit import Comparison, Experiments, Fit, Prediction, Profile
+from lagjax._fit import Comparison, Experiments, Fit, Prediction, Profile, Selection
 from lagjax._run import ContactChanges, Crossings, Impacts, State, Trajectory, Transitions
 from lagjax._scene import Explanation
 from lagjax._show import Animation, Equations
@@ -46,6 +46,6 @@ __all__ = [
     "Animation", "CanonicalTrajectory", "ChangedCoordinates", "Comparison", "Conserved", "ConservedQuantities",
     "ContactChanges", "Crossings", "Equations", "Equilibrium", "Experiments", "Explanation", "Family", "Finding",
     "Findings", "Fit", "Hamiltonian", "Health", "Impacts", "Linearization", "LyapunovExponent", "Modes", "Orbit",
-    "Path", "Prediction", "Profile", "ReducedLinearization", "Routhian", "SameMotion", "State", "Status",
+    "Path", "Prediction", "Profile", "ReducedLinearization", "Routhian", "SameMotion", "Selection", "State", "Status",
     "SteadyMotion", "Summary", "Trajectory", "Transitions", "WorkPrecision", "WorkPrecisionRow",
 ]  # fmt: skip

@@ -1,8 +1,7 @@
 """The systems that several test files share: each is derived, and compiled for one call, once for all of them.
 
-A test takes one of these where any system of its kind serves; what it asks of a Lagrangian of its own stands beside it.
-A test takes one of these where any system of its kind serves; a Lagrangian that it needs of its own stands beside it.
-offers are `lagjax.scenes`.
+A test takes one of these where any system of its kind serves; a Lagrangian that it needs of its own stands at the top
+of its file. The scenes that lagjax offers are `lagjax.scenes`.
 """
 
 import jax.numpy as jnp

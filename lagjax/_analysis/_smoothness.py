@@ -36,7 +36,7 @@ class _Roughness(NamedTuple):
 
 
 def is_smooth(scene: SceneState) -> Bool[Array, ""]:
-    if not _function_borders(scene.derivation):
+    if not _is_pieced(scene.derivation):
         return jnp.asarray(True)
     rough = _measure_roughness(scene)
     return ~jnp.any(rough.jumps | rough.kinks)
@@ -44,11 +44,13 @@ def is_smooth(scene: SceneState) -> Bool[Array, ""]:
 
 def require_smooth(scene: SceneState, what: str) -> None:
     """Raise `ValueError` where the force jumps or has a kink at the state, naming the coordinate and the line."""
-    if not scene.concrete or not (pieces := _function_borders(scene.derivation)):
+    if not scene.concrete or not _is_pieced(scene.derivation):
         return
     rough = jax.tree.map(np.asarray, _measure_roughness(scene))
     names = (*scene.layout.names, *(f"d{name}" for name in scene.layout.names))
     for k in np.flatnonzero(rough.jumps | rough.kinks).tolist():
+        written = scene.system._motion(scene.layout, scene.params)  # whose lines are to be named
+        pieces = pieces_of_motion(written, *scene.derivation.state_shapes)
         labels = [f"{name}{place}" for name, place, size in pieces for _ in range(size)]
         operation = labels[int(np.argmax(rough.changed[k]))]
         how = "the force jumps there" if rough.jumps[k] else "the force has another slope on either side"
@@ -61,9 +63,8 @@ def require_smooth(scene: SceneState, what: str) -> None:
 
 
 @functools.lru_cache(maxsize=64)
-def _function_borders(derivation: Derivation) -> list[tuple[str, str, int]]:
-    """The borders of the functions of a scene: name, place, and how many numbers each compares."""
-    return pieces_of_motion(derivation.motion, *derivation.state_shapes)
+def _is_pieced(derivation: Derivation) -> bool:
+    return bool(pieces_of_motion(derivation.motion, *derivation.state_shapes))
 
 
 def _measure_roughness(scene: SceneState) -> _Roughness:

@@ -41,7 +41,7 @@ BYTES_OF_ENTRY = 20
 
 # Coordinates from which patterns of zeros are looked for: below, machine code is as quick.
 LEAST_COORDINATES = 100
-# Scalar operations of L from which such a scene runs on arrays: a ring of 1000 (11 000) takes 3.5 s to a first result by
+# Scalar operations of L from which such a scene runs on arrays: a ring of 1000 (11 000) takes 3.5 s to a first one by
 # machine code, 2 s by arrays, whose time hardly grows; a batch of 256 rings of 300 is 30 times faster in machine code.
 LEAST_OPERATIONS = 6000
 # Coordinates from which it does with constraints: 100 rods (200 coordinates) take machine code 4 s, 500 rods more than

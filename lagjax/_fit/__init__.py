@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._fit.model._assembly import GivenSystem, assemble_residuals, read_systems
+from lagjax._fit.model._law_parameters import find_laws, terms
 from lagjax._fit.model._noise import AbstractNoise, Clipped, Gaussian, Quantised, StudentT
 from lagjax._fit.model._parameters import Parameters, per_record
 from lagjax._fit.model._records import Guess, Record, require_untraced
@@ -39,6 +40,7 @@ from lagjax._fit.result._prediction import Prediction
 from lagjax._fit.result._profile import Profile
 from lagjax._fit.result._report import draw_record
 from lagjax._fit.result._result import Fit
+from lagjax._fit.result._selection import Selection, keep_selected, select_terms
 from lagjax._fit.result._verdict import is_doubtful
 from lagjax._fit.search._multistart import run_multistart
 from lagjax._fit.search._reader import TimeScales, first_starts, read_records, time_scales
@@ -115,6 +117,7 @@ def fit(
       gradients with optax's Adam: for scenes with neural terms, an `equinox.nn.MLP` in `params0` for instance. With
       more than a hundred free numbers the other methods say in a warning that this one is meant for them.
 
+    Of a law of candidate terms (`lagjax.terms`) in `params0` those are 0 that the motion does not ask for.
     Intervals take the correlation of residuals into account (`Fit.noise`). `Fit.unseen` says in words which parameters
     the data do not determine; their intervals are infinite.
 
@@ -143,6 +146,8 @@ def fit(
     if hold not in HOLDS:
         raise ValueError(f"hold must be one of {', '.join(map(repr, HOLDS))}; got {hold!r}.")
     require_untraced(params0, "params0")
+    if method == "gradient" and any(law.law.selects for law in find_laws(params0)):
+        raise ValueError('method="gradient" chooses no terms: leave it, or fit all terms, dict(law.params0).')
     noise = Gaussian() if noise is None else noise
     if not isinstance(noise, AbstractNoise):
         raise TypeError(f"noise must be lagjax.Gaussian(), StudentT(), Quantised(…) or Clipped(…); got {noise!r}.")
@@ -167,6 +172,9 @@ def fit(
         raise ValueError(" ".join([text, *more])) from None
     if not left.doubted:
         return done
+    if (selection := done.selection) is not None:
+        laws = find_laws(params0)
+        search = search._replace(build=lambda records: keep_selected(build(records), selection, laws))
     more = search.find_mistake(given, left, time.process_time() - begun)
     return replace(done, ok=done.ok and not more, message=" ".join([done.message, *more]))
 
@@ -186,7 +194,7 @@ class _FitSearch(NamedTuple):
         """The fit of records that were checked, and what it leaves. Raises `LostMotion` where none can be followed.
 
         Motion that sticks, or strikes, has many minima: with `looks_further` more starts are tried where one leaves
-        motion.
+        motion, and candidate terms are chosen.
         """
         parameters = self.build(sum(len(one.records) for one in given))
         residuals = assemble_residuals(given, parameters, self.law)
@@ -215,7 +223,11 @@ class _FitSearch(NamedTuple):
                 descent = max(descent, other, key=lambda one: one.residuals.log_likelihood(one.trial, one.noise))
             descent = search_again(descent, self.law)
         residuals.watch = descent.residuals.watch = None
-        return Fit.from_descent(descent, self.law, waterfall)
+        laws, selection = [law for law in find_laws(self.params0) if law.law.selects], None
+        if laws and looks_further:
+            tell = _print_line if self.progress else None
+            descent, selection = select_terms(descent, self.law, laws, tell)
+        return Fit.from_descent(descent, self.law, waterfall, selection)
 
     def _require_one_beginning(self, residuals: Residuals) -> None:
         if not len(residuals.parameters) and (self.method == "gradient" or self.starts > 1):
@@ -286,6 +298,10 @@ def _print_trials(size: np.ndarray) -> Callable[[Any], None]:
         else:
             rms = np.sqrt(np.mean(trial.flat() ** 2, axis=0)) / size
             text = f"{len(trial.starts)} motions, residuals {np.exp(np.mean(np.log(rms))):.4g} of the signals"
-        print(f"trial {next(count)}: {text}", file=sys.stderr, flush=True)
+        _print_line(f"trial {next(count)}: {text}")
 
     return tell
+
+
+def _print_line(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

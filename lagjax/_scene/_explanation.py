@@ -222,7 +222,9 @@ def _border_facts(problem: Problem, inputs: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _borders_in_lines(problem: Problem) -> dict[str, Any]:
-    pieces = pieces_of_motion(problem.derivation.motion, *problem.derivation.state_shapes)
+    # Functions of this very system: its derivation may be that of another one, whose text stands in another line.
+    motion = problem.system._motion(problem.layout, problem.params)
+    pieces = pieces_of_motion(motion, *problem.derivation.state_shapes)
     names = tuple(f"{name}{place}" for name, place, size in pieces for _ in range(size))
     return {"borders": names, "borders_located": not names}
 

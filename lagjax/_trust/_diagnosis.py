@@ -21,6 +21,7 @@ from lagjax._engine import AHEAD
 from lagjax._equations import (
     CoupledForces,
     Derivation,
+    Motion,
     Sample,
     derivation_of,
     describe_pieces,
@@ -136,9 +137,9 @@ def _find_cause(system: System, layout: Layout, params, ended: Ended) -> str:
         if np.isfinite(halves(ended.y)[0]).all() and derivation.kicks:
             return f"\n{_AT_CORNER}"
         return f"\n{_reset_to_nothing(layout, ended) if ended.by_resets else _OVERSTEPPED}"
-    text = _describe_undefined(derivation, params, ended) or _describe_singular_mass(derivation, ended)
+    text = _describe_undefined(system, derivation, params, ended) or _describe_singular_mass(derivation, ended)
     if not text and (at := _describe_runaway(derivation, ended)) is not None:
-        text = _escape_place(derivation, params, ended, at)
+        text = _escape_place(system, derivation, params, ended, at)
     return f"\n{text}" if text else _run_check(system, derivation, params, ended) or _budget_end(ended)
 
 
@@ -216,7 +217,7 @@ def _quantities_ahead(derivation: Derivation, numbers, ended: Ended) -> tuple[np
     return y, t, values
 
 
-def _describe_undefined(derivation: Derivation, params, ended: Ended) -> str:
+def _describe_undefined(system: System, derivation: Derivation, params, ended: Ended) -> str:
     """A sentence about the first of the scene's quantities that is not finite at the end or just ahead; or nothing."""
     numbers, along = eqx.filter(params, eqx.is_array_like), 1 + len(AHEAD)
     y, t, values = _quantities_ahead(derivation, numbers, ended)
@@ -230,14 +231,14 @@ def _describe_undefined(derivation: Derivation, params, ended: Ended) -> str:
                 shown = join_names([f"{derivation.layout.names[i]} ({of[row, i]})" for i in bad])
                 by_time = row and not np.isfinite(of[row - 1 + along, bad]).any()
                 since = f", from t = {t[row]:.9g} on, whatever the state" if by_time else ""
-                offender = _blame_operation(derivation, role, (*halves(y[row]), float(t[row]), numbers))
+                motion = system._motion(derivation.layout, params)
+                offender = _blame_operation(motion, role, (*halves(y[row]), float(t[row]), numbers))
                 return f"Not finite {'just ahead' if row else 'there'}: {what} {shown}{since}{offender}."
     return ""
 
 
-def _blame_operation(derivation: Derivation, role: str, arguments: tuple) -> str:
+def _blame_operation(motion: Motion, role: str, arguments: tuple) -> str:
     """The operation to blame of one of the scene's functions, and its line, as the end of a sentence."""
-    motion = derivation.motion
     function, on = getattr(motion, role), motion.constraints.on_positions
     if role == "constraints":
         function = on and (lambda q, qdot, t, params: on(q, t, params))
@@ -249,9 +250,11 @@ def _blame_operation(derivation: Derivation, role: str, arguments: tuple) -> str
     return f". It comes from {to_blame[0]}" if to_blame else ""
 
 
-def _short_functions(derivation: Derivation, params, ended: Ended) -> tuple[list[Callable], tuple]:
+def _short_functions(system: System, layout: Layout, params, ended: Ended) -> tuple[list[Callable], tuple]:
     """The forces and L, as far as the scene has them and they can be gone through; and their arguments at the end."""
-    motion, arguments = derivation.motion, (*halves(ended.y), ended.t, eqx.filter(params, eqx.is_array_like))
+    # The functions of this very system: its derivation may be that of another one, whose text stands in another line.
+    motion = system._motion(layout, params)
+    arguments = *halves(ended.y), ended.t, eqx.filter(params, eqx.is_array_like)
     return [f for f in (motion.forces, motion.lagrangian) if f is not None and _is_short(f, arguments)], arguments
 
 
@@ -337,9 +340,9 @@ def _describe_runaway(derivation: Derivation, ended: Ended) -> int | None:
     return fastest if scale < part * abs(ended.t_last - ended.t_first) and velocity[fastest] > 0 else None
 
 
-def _escape_place(derivation: Derivation, params, ended: Ended, place: int) -> str:
+def _escape_place(system: System, derivation: Derivation, params, ended: Ended, place: int) -> str:
     """The place that a coordinate runs away to: a pole of an operation of the force or of L, or infinity."""
-    functions, arguments = _short_functions(derivation, params, ended)
+    functions, arguments = _short_functions(system, derivation.layout, params, ended)
     pole = next((near for function in functions for near in poles(function, *arguments)), None)
     name, (q, v), (q_first, v_first) = derivation.layout.names[place], halves(ended.y), halves(ended.y_first)
     grown = f"its velocity was {v_first[place]:.3g} at the start and is {v[place]:.3g} where {name} = {q[place]:.3g}"
@@ -388,7 +391,7 @@ def _run_check(system: System, derivation: Derivation, params, ended: Ended) -> 
     found = {finding.kind: finding for finding in reversed(list(check(system, q, qdot, ended.t, params)))}
     if (kind := next((kind for kind in _EXPLAIN if kind in found), None)) is not None:
         return f"\nThere check says: {found[kind].message}{_budget_end(ended)}"
-    functions, arguments = _short_functions(derivation, params, ended)
+    functions, arguments = _short_functions(system, derivation.layout, params, ended)
     if system.touches:
         flat = Flat.from_system(system, derivation.layout, params)
         of_contacts = (lambda q, qdot, t, p: flat.gaps(q, t, p)), flat.one_way, flat.slips

@@ -116,6 +116,5 @@ def test_a_sample_time_has_the_impacts_within_it():
 
 def test_a_contact_that_opens_within_the_sample_time_is_an_error():
     top = np.array([np.sin(0.5), np.cos(0.5)]), 2.0 * np.array([np.cos(0.5), -np.sin(0.5)])
-    assert lagjax.linearize(HILL, *top, dt=0.05).Phi.shape == (4, 4)
     with pytest.raises(ValueError, match="a contact that is closed at this state opens"):
         lagjax.linearize(HILL, *top, dt=0.5)

@@ -76,13 +76,17 @@ def test_forces_and_constraints_come_along():
 # ---- phase space -----------------------------------------------------------------------------------------------------
 
 
+def double_by_places(q, v, t, params):  # driven, and with a term linear in the velocities, so that p is not M q̇
+    kinetic = v[0] ** 2 + jnp.cos(q[0] - q[1]) * v[0] * v[1] + 0.5 * v[1] ** 2
+    return kinetic + params * (2 * jnp.cos(q[0]) + jnp.cos(q[1])) + jnp.sin(t) * q[1] * v[0]
+
+
+DAMPED_DOUBLE = lagjax.System(double_by_places, forces=lambda q, v: -0.1 * v)
+
+
 @pytest.mark.slow
 def test_canonical_motions_obey_hamiltons_equations():
-    def double(q, v, t, params):  # driven, and with a term linear in the velocities, so that p is not M q̇
-        kinetic = v[0] ** 2 + jnp.cos(q[0] - q[1]) * v[0] * v[1] + 0.5 * v[1] ** 2
-        return kinetic + params * (2 * jnp.cos(q[0]) + jnp.cos(q[1])) + jnp.sin(t) * q[1] * v[0]
-
-    canonical = lagjax.hamiltonian(lagjax.System(double, forces=lambda q, v: -0.1 * v))
+    canonical = lagjax.hamiltonian(DAMPED_DOUBLE)
     q0, v0, g = jnp.array([1.0, 0.5]), jnp.array([0.3, -0.2]), 9.81
     p0 = canonical.momentum(q0, v0, 0.0, g)
     np.testing.assert_allclose(canonical.velocity(q0, p0, 0.0, g), v0, atol=1e-15)
@@ -96,9 +100,12 @@ def test_canonical_motions_obey_hamiltons_equations():
     np.testing.assert_allclose(slope[0], (moved[0] - moved[1]) / 2e-5, rtol=1e-5)
 
 
+BOUNDED = lagjax.System(lambda q, v: -jnp.sqrt(1 - v @ v) - 0.5 * q @ q)
+
+
 @pytest.mark.slow
 def test_legendre_where_velocities_are_bounded():
-    canonical = lagjax.hamiltonian(lagjax.System(lambda q, v: -jnp.sqrt(1 - v @ v) - 0.5 * q @ q))
+    canonical = lagjax.hamiltonian(BOUNDED)
     q, v = jnp.array([1.0, 0.5]), jnp.array([0.9, -0.4])
     p = canonical.momentum(q, v)
     np.testing.assert_allclose(canonical.velocity(q, p), v, rtol=1e-12)

@@ -124,7 +124,11 @@ def test_reduced_equations_have_the_fewest_states():
     )
     closed = reduced.A - reduced.B[:, :1] @ reduced.B[:, :1].T @ regulator
     assert np.linalg.eigvals(closed).real.max() < 0
-    # Along a skate's motion its blade turns with it: x' sin φ − y' cos φ keeps (δφ, δx', δy') in a plane.
+
+
+@pytest.mark.slow
+def test_a_blade_turns_with_its_skate():
+    """x' sin φ − y' cos φ keeps (δφ, δx', δy') in a plane."""
     sliding = lagjax.linearize(SKATE, np.zeros(3), np.array([2.0, 0.0, 0.0])).reduced()
     assert sliding.A.shape == (5, 5)
     np.testing.assert_allclose(2.0 * sliding.basis[2] - sliding.basis[4], 0.0, atol=1e-14)
@@ -169,11 +173,13 @@ def test_wrong_arguments(arguments, sentence):
     assert sentence in str(error.value)
 
 
+MOVED = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q, inputs: q[0] - inputs)
+
+
 def test_inputs_that_nothing_or_a_constraint_reads():
     with pytest.raises(ValueError, match="no function of the scene asks for `inputs`"):
         lagjax.linearize(PLAIN, TOP, params=M, inputs=1.0)
-    moved = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q, inputs: q[0] - inputs)
     with pytest.raises(ValueError, match="constraints asks for `inputs`"):
-        lagjax.linearize(moved, np.zeros(2), inputs=0.0)
+        lagjax.linearize(MOVED, np.zeros(2), inputs=0.0)
     with pytest.raises(AttributeError, match="call linearize"):
         _ = lagjax.linearize(ROD, np.array([0.0, -L])).Phi

@@ -252,14 +252,18 @@ def test_what_has_no_modes_is_said():
         jax.jit(lambda g: lagjax.normal_modes(redundant, down, g).frequencies)(G)
 
 
+def molecule(q, v, params):
+    masses = jnp.array([16.0, 1.0, 1.0])
+    stretched = [jnp.sqrt(jnp.sum((q[i] - q[j]) ** 2)) - r for i, j, r in ((0, 1, 1.0), (0, 2, 1.0), (1, 2, 1.5))]
+    return 0.5 * jnp.sum(masses[:, None] * v**2) - 0.5 * params * sum(x**2 for x in stretched)
+
+
+MOLECULE = lagjax.System(molecule)
+
+
 @pytest.mark.slow
 def test_a_molecule_has_three_zero_modes_in_the_plane():
-    def molecule(q, v, params):
-        masses = jnp.array([16.0, 1.0, 1.0])
-        stretched = [jnp.sqrt(jnp.sum((q[i] - q[j]) ** 2)) - r for i, j, r in ((0, 1, 1.0), (0, 2, 1.0), (1, 2, 1.5))]
-        return 0.5 * jnp.sum(masses[:, None] * v**2) - 0.5 * params * sum(x**2 for x in stretched)
-
-    system, guess = lagjax.System(molecule), np.array([[0.0, 0.0], [0.8, 0.7], [-0.8, 0.6]])
+    system, guess = MOLECULE, np.array([[0.0, 0.0], [0.8, 0.7], [-0.8, 0.6]])
 
     def frequencies(stiffness):
         return lagjax.normal_modes(system, lagjax.equilibrium(system, guess, stiffness).q, stiffness).frequencies
@@ -350,8 +354,8 @@ def test_nothing_is_linear_at_a_border(name):
     "force, frequency",
     [
         (lambda q, qdot: -0.1 * qdot * jnp.abs(qdot), np.sqrt(2)),  # smooth at rest, though abs is not
-        (lambda q, qdot: -3 * jnp.maximum(q, 0.0) ** 2, np.sqrt(2)),
-        (lambda q, qdot: -jnp.clip(q, -1.0, 1.0), np.sqrt(3)),  # no border here
+        pytest.param(lambda q, qdot: -3 * jnp.maximum(q, 0.0) ** 2, np.sqrt(2), marks=pytest.mark.slow),
+        pytest.param(lambda q, qdot: -jnp.clip(q, -1.0, 1.0), np.sqrt(3), marks=pytest.mark.slow),  # no border here
         (lambda q, qdot: -q * jnp.where(jnp.abs(qdot) < 1e-6, 1.0, 2.0), np.sqrt(3)),  # one that is beside
     ],
 )

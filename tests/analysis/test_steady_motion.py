@@ -157,6 +157,10 @@ def test_coordinates_may_move_together():
     motion = lagjax.steady_motion(ROLLER, {"w": 0.0, "x": 0.0}, {"w": 7.0, "x": 3.0}, 1.0)
     np.testing.assert_allclose([motion.qdot["x"], motion.qdot["w"]], [5.0, 10.0], rtol=1e-12)
     np.testing.assert_allclose(exponents(ROLLER, motion, 1.0), [-0.2 / 3], rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_row_of_rotors_turns_as_one():
     motion = lagjax.steady_motion(ROTORS, np.zeros(6), np.full(6, 2.0), hold="qdot[4]")
     np.testing.assert_allclose(motion.qdot, np.full(6, 2.0), rtol=1e-12)
     assert motion.cyclic.tolist() == [False] * 4 + [True, False]

@@ -134,38 +134,46 @@ def general(q, v, params):
     return 0.5 * v @ mass @ v + waves + jnp.sum(params["c"] * jnp.sin(params["k"] @ q)) * (params["b"] @ v)
 
 
+RANDOM = lagjax.System(general)
+
+
 @pytest.mark.slow
 def test_no_false_report_on_100_random_systems():
-    system = lagjax.System(general)
     for seed in range(100):
         draw = np.random.default_rng(seed).normal
         shapes = {"m": (3, 3), "a": (4,), "k": (4, 3), "f": (4,), "c": (4,), "b": (3,)}
         params = {name: draw(size=shape) for name, shape in shapes.items()}
-        assert names(system, np.asarray(draw(size=3)), np.asarray(draw(size=3)), params) == ["energy"], seed
+        assert names(RANDOM, np.asarray(draw(size=3)), np.asarray(draw(size=3)), params) == ["energy"], seed
+
+
+def screw(q, v):
+    return 0.5 * v @ v - jnp.cos(jnp.arctan2(q[1], q[0]) - 2 * q[2]) * (q[0] ** 2 + q[1] ** 2)
+
+
+SCREW = lagjax.System(screw)
 
 
 @pytest.mark.slow
 def test_combinations():
-    def screw(q, v):
-        return 0.5 * v @ v - jnp.cos(jnp.arctan2(q[1], q[0]) - 2 * q[2]) * (q[0] ** 2 + q[1] ** 2)
-
-    found = names(lagjax.System(screw), jnp.array([1.0, 0.3, 0.2]), jnp.array([1.0, 0.5, 0.2]))
+    found = names(SCREW, jnp.array([1.0, 0.3, 0.2]), jnp.array([1.0, 0.5, 0.2]))
     assert found == ["energy", "combination: +0.5 translation of q[2], +1 rotation from q[0] to q[1]"]
     assert names(WAVE, np.ones(2), np.ones(2)) == ["combination: +1 time translation, +1 translation of q[0]"]
+
+
+def attract(q, v, params):
+    return -params * q / jnp.sum(q**2) ** 1.5
+
+
+KEPLER_BY_FORCE = lagjax.System(lagrangians.free_particles, forces=attract)
 
 
 @pytest.mark.slow
 def test_forces_with_a_potential_conserve_what_l_would():
     """Kepler's force, on an orbit whose chords pass the centre: the energy is that of L = T − V but for a constant."""
-
-    def force(q, v, params):
-        return -params * q / jnp.sum(q**2) ** 1.5
-
     state = np.array([1.0, 0.0]), np.array([0.0, 1.2])
-    kepler = lagjax.System(lagrangians.free_particles, forces=force)
-    found = {c.name: c for c in lagjax.conserved_quantities(kepler, *state, 1.3)}
+    found = {c.name: c for c in lagjax.conserved_quantities(KEPLER_BY_FORCE, *state, 1.3)}
     assert list(found) == ["energy", "angular momentum in the plane 01"]
-    run = lagjax.simulate(kepler, *state, np.linspace(0.0, 20.0, 50), 1.3)
+    run = lagjax.simulate(KEPLER_BY_FORCE, *state, np.linspace(0.0, 20.0, 50), 1.3)
     energy = jax.vmap(lambda q, v: found["energy"].charge(q, v, params=1.3))(run.q, run.qdot)
     exact = 0.5 * np.sum(run.qdot**2, axis=1) - 1.3 / np.linalg.norm(run.q, axis=1)
     np.testing.assert_allclose(energy - energy[0], exact - exact[0], atol=1e-9)
@@ -182,12 +190,15 @@ def test_a_dilation():
     np.testing.assert_allclose(found["dilation"].charge(*state, 2.0), 2.0 * (0.5 * 1.48 + 0.5) - 0.5 * 0.2, rtol=1e-12)
 
 
+LOGARITHM = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.log(q))
+
+
 @pytest.mark.slow
 def test_toda_and_a_damped_oscillator():
     assert names(TODA, np.zeros(3), np.ones(3)) == ["energy", "total momentum", "centre of all coordinates"]
     assert names(DAMPED, 1.0, 0.5) == ["combination: +1 time translation, -0.2 scaling of q"]
     with pytest.raises(ValueError, match="finite at no state"):
-        names(lagjax.System(lambda q, v: 0.5 * v**2 + jnp.log(q)), -5.0, 0.5)
+        names(LOGARITHM, -5.0, 0.5)
 
 
 @pytest.mark.slow
@@ -237,13 +248,15 @@ def test_charges_by_hand():
 # ---- the same motion -------------------------------------------------------------------------------------------------
 
 
+NOTHING = lagjax.System(lambda q, v: q * v)
+
+
 @pytest.mark.slow
 def test_what_is_not_the_same_motion_is_said_where():
     other = lagjax.same_motion(FREE, SPRING, 0.0, 1.0)
     assert other.same is False and other.residual > 1e-2 and "the equation of q at q = (" in other.where
-    nothing = lagjax.System(lambda q, v: q * v)
-    assert not lagjax.same_motion(FREE, nothing, 0.0, 1.0).same
-    assert not lagjax.same_motion(nothing, FREE, 0.0, 1.0).same
+    assert not lagjax.same_motion(FREE, NOTHING, 0.0, 1.0).same
+    assert not lagjax.same_motion(NOTHING, FREE, 0.0, 1.0).same
 
 
 @pytest.mark.slow

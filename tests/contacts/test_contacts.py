@@ -153,14 +153,16 @@ def test_a_motion_goes_on_from_where_it_came_to_an_impact():
         lagjax.simulate(DROP, -1e-6, 1.0, np.array([0.0, 1.0]))
 
 
+SPRING_OVER_A_FLOOR = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2, contacts=lambda q: q, restitution=0.8)
+
+
 def test_a_stretch_of_many_steps_is_finished_in_threads_of_xla_too(monkeypatch):
     # These take the smallest numbers for zero: whether a kernel has more to do must not be one. A kernel of few rounds
     # needs a scene of its own.
     monkeypatch.setattr("lagjax._run.jumps._scene_code._ROUNDS", 1)
-    spring = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2, contacts=lambda q: q, restitution=0.8)
 
     def end(h):
-        return lagjax.simulate(spring, h, 0.0, np.array([0.0, 2.0])).q[-1]
+        return lagjax.simulate(SPRING_OVER_A_FLOOR, h, 0.0, np.array([0.0, 2.0])).q[-1]
 
     slope = 0.8 * np.sin(2.0 - np.pi / 2)  # q = h cos t, and −0.8 h cos t behind the floor
     np.testing.assert_allclose(end(1.5), 1.5 * slope, rtol=1e-11)
@@ -405,11 +407,11 @@ def test_contacts_in_a_text_about_the_system():
 @pytest.mark.slow
 @pytest.mark.parametrize("draws", [False, True], ids=["the same tosses", "random ones"])
 def test_intervals_of_restitution_and_friction_hold_them_as_often_as_they_say(draws):
-    """Four noisy tosses along a rough floor, 100 times: within three standard errors, of 2.2 %, of 95 %."""
-    found = fit_tosses(100, draws)
+    """Four noisy tosses along a rough floor, 50 times: within three standard errors, of 3.1 %, of 95 %."""
+    found = fit_tosses(50, draws)
     assert found["not ok"] <= 3 * draws  # tosses that stop at once, and two that end at a kink
     for name in ("e", "mu"):
-        assert abs(found[f"held {name}"] - 0.95) < 0.066 and abs(found[f"bias {name}"]) < 3
+        assert abs(found[f"held {name}"] - 0.95) < 0.093 and abs(found[f"bias {name}"]) < 3
 
 
 @pytest.mark.slow
@@ -493,7 +495,9 @@ def test_both_laws_agree_where_all_contacts_press_alike():
 
     def rates_behind(impacts, e):
         balls = lagjax.System(
-            lambda q, v: 0.5 * v @ v, contacts=lambda q: q[1:] - q[:-1], restitution=lambda params: params,
+            lambda q, v: 0.5 * v @ v,
+            contacts=lambda q: q[1:] - q[:-1],
+            restitution=lambda params: params,
             impacts=impacts,
         )  # fmt: skip
         start = jnp.array([-0.5, 0.0, 0.0]), jnp.array([1.0, 0.0, 0.0])
@@ -784,15 +788,17 @@ def test_beads_that_do_not_rebound_share_their_momentum():
     np.testing.assert_allclose(run.qdot[-1], np.full(n, 1 / n), atol=1e-14)
 
 
+ROW_OF_BEADS = lagjax.System(
+    lambda q, v: 0.5 * jnp.sum(v**2), contacts=lambda q: q[1:] - q[:-1] - 0.5, restitution=lambda params: params
+)
+
+
 def test_derivatives_of_thirty_contacts():
     """The last bead of a row that passes a blow on has a speed in closed form, ((1 + e)/2)ⁿ⁻¹."""
     n = 26
-    row = lagjax.System(
-        lambda q, v: 0.5 * jnp.sum(v**2), contacts=lambda q: q[1:] - q[:-1] - 0.5, restitution=lambda params: params
-    )
 
     def last(e):
-        return lagjax.simulate(row, np.arange(n) * 1.0, np.eye(n)[0], np.array([0.0, 20.0]), e).qdot[-1, -1]
+        return lagjax.simulate(ROW_OF_BEADS, np.arange(n) * 1.0, np.eye(n)[0], np.array([0.0, 20.0]), e).qdot[-1, -1]
 
     e, blows = 0.95, n - 1
     value, slope = jax.jit(jax.value_and_grad(last))(e)
@@ -814,7 +820,7 @@ def test_outputs_at_the_start_vary_where_a_contact_closes_there(up):
         np.testing.assert_allclose(np.stack(slopes, 1), expected, atol=1e-14)
 
 
-@pytest.mark.parametrize("law", ["linear", "pieces"])
+@pytest.mark.parametrize("law", [pytest.param("linear", marks=pytest.mark.slow), "pieces"])
 def test_forces_read_normal_forces_in_a_scene_whose_first_motion_is_traced(law):
     """It falls and slides on against a drag c N ẋ: x = t₁ + (1 − exp(−c g (2 − t₁))) / (c g)."""
 

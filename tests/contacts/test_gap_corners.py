@@ -188,13 +188,17 @@ def test_a_potential_step_beside_a_contact():
     np.testing.assert_allclose(run.qdot[2], -1.0, rtol=0, atol=1e-13)
 
 
+TABLE_BESIDE = lagjax.System(
+    lambda q, v, params: 0.5 * v**2 + q * jnp.interp(q, jnp.array([-2.0, 0.0, 2.0]), params),
+    contacts=lambda q: 1 - q,
+    restitution=1.0,
+)
+
+
 @pytest.mark.slow
 def test_a_table_beside_a_contact_has_derivatives_by_its_entries():
     def end(entries):
-        system = lagjax.System(
-            lambda q, v, params: 0.5 * v**2 + q * jnp.interp(q, jnp.array([-2.0, 0.0, 2.0]), params),
-            contacts=lambda q: 1 - q, restitution=1.0,
-        )  # fmt: skip
+        system = TABLE_BESIDE  # fmt: skip
         return lagjax.simulate(system, 0.2, 1.0, jnp.array([0.0, 2.0]), entries).q[-1]
 
     entries, moved = np.array([0.1, 0.0, 1.0]), 1e-6 * np.eye(3)

@@ -162,7 +162,9 @@ def test_who_explains_a_large_scene_with_contacts_names_the_solver_it_has():
     assert chain(None, path="array").explain(np.zeros(many), np.ones(many), params=PARAMS).path == "array"
 
 
+FREE_BEFORE_A_WALL = lagjax.System(lambda q, v: 0.5 * v @ v, contacts=lambda q: 0.5 - q[-1])
+
+
 def test_a_scene_that_does_not_fit_is_refused_in_a_sentence():
-    scene = lagjax.System(lambda q, v: 0.5 * v @ v, contacts=lambda q: 0.5 - q[-1])
     with pytest.raises(ValueError, match=r"its mass matrix would take some .* GiB of memory"):
-        lagjax.simulate(scene, np.zeros(10**6), np.ones(10**6), TS)
+        lagjax.simulate(FREE_BEFORE_A_WALL, np.zeros(10**6), np.ones(10**6), TS)

@@ -179,7 +179,7 @@ def test_closed_forms_are_those_of_a_reference_that_enumerates_modes(row):
 @pytest.mark.slow
 @pytest.mark.parametrize("many", MANY.values(), ids=lambda many: many.name)
 def test_piecewise_closed_forms_are_those_of_a_reference_that_enumerates_modes(many):
-    q, v, p, right = many.drawn(4)
+    q, v, p, right = many.drawn(2)
     reference = Reference(many.scene, q[0], p[0])
     for member in zip(q, v, p, right, strict=True):
         motion = reference.run(member[0], member[1], many.duration, member[2])

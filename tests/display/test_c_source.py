@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import PENDULUM, PENDULUM_IN_GRAVITY, RELAY, SADDLE, WEIGHT_ON_A_SLIDE
+from sweeps import sweep
 
 import lagjax
 from lagjax import scenes
@@ -88,13 +89,13 @@ def require_bits(built, system, q, qdot, params=None, t=0.3, spread=0.3):
             np.testing.assert_array_equal(found, wanted)
 
 
-READY = [scenes.double_pendulum, scenes.spherical_pendulum, scenes.driven_pendulum, scenes.rolling_disc, scenes.kepler,
-         scenes.cartesian_double_pendulum, scenes.chaplygin_sleigh, scenes.morse_oscillator, scenes.slider_crank,
-         scenes.figure_eight, scenes.relativistic_charge_in_magnetic_field, scenes.damped_driven_oscillator,
-         scenes.chain]  # fmt: skip
+READY = [scenes.double_pendulum, scenes.damped_driven_oscillator, scenes.chaplygin_sleigh, scenes.slider_crank,
+         scenes.kepler, scenes.spherical_pendulum, scenes.driven_pendulum, scenes.rolling_disc,
+         scenes.cartesian_double_pendulum, scenes.morse_oscillator, scenes.figure_eight,
+         scenes.relativistic_charge_in_magnetic_field, scenes.chain]  # fmt: skip
 
 
-@pytest.mark.parametrize("make", READY, ids=lambda make: make.__name__)
+@pytest.mark.parametrize("make", sweep(READY, kept=READY[:5]), ids=lambda make: make.__name__)
 def test_accelerations_in_c_have_the_same_bits(built, make):
     scene = make()
     require_bits(built, scene.system, scene.q0, scene.qdot0, scene.params, spread=0.1)

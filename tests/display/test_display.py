@@ -111,8 +111,11 @@ def test_a_notebook_shows_the_lines_and_a_picture(fallen):
     assert "png" in jax.vmap(lambda z: lagjax.simulate(FALL, 9.0, 0.0, TS * z))(np.ones(2))._repr_html_()
 
 
+NAMED_LIKE_HTML = lagjax.System(lambda q, v: 0.5 * v["<b>"] ** 2)
+
+
 def test_names_that_are_html_are_shown_as_they_are():
-    run = lagjax.simulate(lagjax.System(lambda q, v: 0.5 * v["<b>"] ** 2), {"<b>": 0.0}, {"<b>": 1.0}, TS)
+    run = lagjax.simulate(NAMED_LIKE_HTML, {"<b>": 0.0}, {"<b>": 1.0}, TS)
     assert "<b>" not in run._repr_html_() and "&lt;b&gt;" in run._repr_html_()
 
 
@@ -143,12 +146,15 @@ def test_no_picture_where_there_is_nothing_to_draw(fallen, monkeypatch):
     assert fallen._repr_html_() is None
 
 
+STIFF = lagjax.System(lambda q, v: 0.5 * v**2 - 2 * q**2)
+
+
 def test_results_show_in_a_notebook_what_they_print():
     pretty = pytest.importorskip("IPython.lib.pretty").pretty
 
     crossed = lagjax.crossings(FREE, lambda q, v: q, -1.0, 1.0, TS)
     findings = lagjax.check(FALL, 1.0, 0.0)
-    modes = lagjax.normal_modes(lagjax.System(lambda q, v: 0.5 * v**2 - 2 * q**2), 0.0)
+    modes = lagjax.normal_modes(STIFF, 0.0)
     for result in (crossed, findings, modes, FALL.explain(1.0, 0.0)):
         assert pretty(result) == str(result)
     assert str(crossed) == "1 crossings from t = 1 to 1, all there"
@@ -171,11 +177,19 @@ def test_results_of_the_analysis_read_as_sentences():
     found = lagjax.results.Equilibrium({"x": np.array([0.0, -1.0])}, {"rod": np.array(0.5)}, np.array(True))
     assert str(found) == "Equilibrium at q['x'][0] = 0, q['x'][1] = -1; multipliers['rod'] = 0.5"
     assert str(lagjax.linearize(pendulum, 0.0)) == "δq'' = -1 δq +1 u"
+
+
+@pytest.mark.slow
+def test_results_of_motions_read_as_sentences():
+    pendulum = PENDULUM
     assert str(lagjax.lyapunov_exponent(pendulum, 0.5, 0.0, 5.0)).startswith("Lyapunov exponent -0.0")
     path = lagjax.find_path(pendulum, 0.0, 0.5, 0.0, 1.0)
     assert repr(path).startswith("Path: action 1.08090018, a minimum among nearby paths, 0 conjugate times")
     along = lagjax.family(pendulum, lagjax.periodic_orbit(pendulum, 0.5, 0.0, 6.3), count=3)
     assert repr(along).startswith("Family of 3 orbits, 3 of them stable\nfrom -0.88") and "array" not in repr(along)
+
+
+OF_A_PLACE = lagjax.System(lambda q, v: 0.5 * v.x**2)
 
 
 def test_an_integer_of_params_and_an_unknown_dataclass_are_explained():
@@ -188,7 +202,7 @@ def test_an_integer_of_params_and_an_unknown_dataclass_are_explained():
         x: float
 
     with pytest.raises(TypeError, match=r"call jax.tree_util.register_dataclass\(Place\) once"):
-        lagjax.simulate(lagjax.System(lambda q, v: 0.5 * v.x**2), Place(1.0), Place(0.0), np.array([0.0, 1.0]))
+        lagjax.simulate(OF_A_PLACE, Place(1.0), Place(0.0), np.array([0.0, 1.0]))
 
 
 def test_results_are_printed_by_name(fallen):
@@ -197,8 +211,11 @@ def test_results_are_printed_by_name(fallen):
     assert repr(lagjax.RESULTS.zeno).startswith("lagjax.RESULTS<") and pickle.loads(pickle.dumps(lagjax.RESULTS.zeno))
 
 
+NAMED = lagjax.System(lambda q, v: 0.5 * v["x"] ** 2)
+
+
 def test_a_canonical_motion():
-    motion = lagjax.hamiltonian(lagjax.System(lambda q, v: 0.5 * v["x"] ** 2)).simulate({"x": 0.0}, {"x": 1.0}, TS)
+    motion = lagjax.hamiltonian(NAMED).simulate({"x": 0.0}, {"x": 1.0}, TS)
     assert lines(motion) == [
         "CanonicalTrajectory, float64: q['x'] (5,), and p", "t from 0 to 2 at 5 outputs", "reached the end",
     ]  # fmt: skip

@@ -245,8 +245,6 @@ def test_q_may_be_any_pytree_and_params_may_hold_whole_numbers():
 
 
 NUMBERS = lagjax.System(lambda q, v: 0.5 * v**2 - 3 * 0.1 * q - q**2 / 6 + 1e-9 * q**3 + 2.5e12 * q**4 - np.pi * q**5)
-
-
 OSCILLATOR_OF_DIGITS = lagjax.System(lambda q, v: 0.5 * v**2 - 4.905 * q**2, forces=lambda q, v: -0.3 * v)
 
 

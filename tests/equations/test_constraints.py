@@ -201,6 +201,9 @@ def test_a_velocity_constraint_is_nonholonomic_and_not_vakonomic():
 # ---- what must not matter --------------------------------------------------------------------------------------------
 
 
+STIFF_ROD = lagjax.System(weight, constraints=lambda q: 1e6 * rod(q)["rod"])
+
+
 @pytest.mark.slow
 def test_doubled_and_scaled_constraints_change_no_motion():
     def many(q):
@@ -208,7 +211,7 @@ def test_doubled_and_scaled_constraints_change_no_motion():
 
     q0, qdot0 = hung(1.2, 0.5)
     ts = np.linspace(0, 2, 3)
-    systems = [WEIGHT_ON_A_ROD, lagjax.System(weight, constraints=lambda q: 1e6 * rod(q)["rod"])]
+    systems = [WEIGHT_ON_A_ROD, STIFF_ROD]
     systems += [lagjax.System(weight, constraints=many, path=path) for path in ("auto", "array")]
     once, scaled, *twice = (lagjax.simulate(system, q0, qdot0, ts, rtol=1e-11) for system in systems)
     for other in (scaled, *twice):
@@ -284,14 +287,18 @@ def test_a_coordinate_without_mass_that_a_constraint_holds():
     np.testing.assert_allclose(HELD_WITHOUT_MASS.acceleration(run.q[1], run.qdot[1]), by_arrays, rtol=1e-13)
 
 
+WITHOUT_MASS = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - q[1], constraints=lambda q: q[0] - 1.0)
+MASSES_AS_PARAMS = lagjax.System(lambda q, v, params: 0.5 * params @ v**2 - q[1], constraints=lambda q: q[0] - 1.0)
+
+
 @pytest.mark.slow
 def test_a_singular_saddle_point_is_reported():
     # Neither L nor the constraint holds q[1]; in the second only because a parameter is zero.
-    system = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - q[1], constraints=lambda q: q[0] - 1.0)
+    system = WITHOUT_MASS
     assert np.isnan(system.acceleration(np.array([1.0, 0.0]), np.zeros(2))).all()
     with pytest.raises(lagjax.SimulationError):
         lagjax.simulate(system, np.array([1.0, 0.0]), np.zeros(2), np.array([0.0, 1.0]))
-    system = lagjax.System(lambda q, v, params: 0.5 * params @ v**2 - q[1], constraints=lambda q: q[0] - 1.0)
+    system = MASSES_AS_PARAMS
     q0, masses = np.array([1.0, 0.0]), np.array([[1.0, 2.0], [0.0, 2.0], [1.0, 0.0]])
     run = lagjax.simulate_batch(system, q0, 0 * q0, np.array([0.0, 1.0]), masses, batch_axes=(None, None, 0))
     assert (run.result == lagjax.RESULTS.mass_matrix_singular).tolist() == [False, False, True]
@@ -433,6 +440,9 @@ def row_alone(a, qdot, params):
     return 0.5 * ((loops + 1) / 3 + loops) * qdot**2 - 9.81 * ((loops + 1) / 2 + loops) * jnp.sin(a)
 
 
+ROW_ALONE = lagjax.System(row_alone)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("loops", [1, 2, 3, 10])
 def test_rows_of_four_bars_pass_flat_configurations(loops):
@@ -441,7 +451,7 @@ def test_rows_of_four_bars_pass_flat_configurations(loops):
     rng = np.random.default_rng(0)
     start = rng.uniform(0.3, 2.8, members)
     rate = rng.uniform(3, 30, members) * rng.choice([-1, 1], members)
-    free = lagjax.simulate_batch(lagjax.System(row_alone), start, rate, ts, {"loops": loops}, rtol=1e-13)
+    free = lagjax.simulate_batch(ROW_ALONE, start, rate, ts, {"loops": loops}, rtol=1e-13)
 
     def joints(x, y):
         return np.stack([f for i in range(loops + 1) for f in (i + x, y)], axis=-1)
@@ -486,20 +496,26 @@ def corners(angle):
     return jnp.concatenate([a, a + c - d, c, d])
 
 
+PEAUCELLIER = lagjax.System(peaucellier, constraints=closed_peaucellier)
+
+
+def peaucellier_alone(angle, rate):
+    return peaucellier(*jax.jvp(corners, (angle,), (rate,)))
+
+
+PEAUCELLIER_ALONE = lagjax.System(peaucellier_alone)
+
+
 @pytest.mark.slow
 def test_a_peaucellier_linkage_passes_its_flat_rhombus():
     members, ts, rng = 60, np.linspace(0, 0.3, 4), np.random.default_rng(4)
     start, rate = rng.uniform(-0.9, -0.3, members), rng.uniform(2, 4, members)
 
-    def alone(angle, rate):
-        return peaucellier(*jax.jvp(corners, (angle,), (rate,)))
-
-    free = lagjax.simulate_batch(lagjax.System(alone), start, rate, ts, rtol=1e-13)
+    free = lagjax.simulate_batch(PEAUCELLIER_ALONE, start, rate, ts, rtol=1e-13)
     assert np.mean(free.q[:, -1] > 0) > 0.9
     q0, qdot0 = jax.vmap(lambda angle, rate: jax.jvp(corners, (angle,), (rate,)))(start, rate)
-    system = lagjax.System(peaucellier, constraints=closed_peaucellier)
     for rtol in (1e-7, 1e-9, 1e-10):
-        run = lagjax.simulate_batch(system, q0, qdot0, ts, rtol=rtol)
+        run = lagjax.simulate_batch(PEAUCELLIER, q0, qdot0, ts, rtol=rtol)
         assert run.ok.all() and drift(run) < DRIFT
         np.testing.assert_allclose(run.q, jax.vmap(jax.vmap(corners))(free.q), atol=10 * rtol)
 
@@ -571,14 +587,17 @@ def test_parallelogram_linkages_pass_the_flat_configuration():
     np.testing.assert_allclose(run.q, np.stack([free.q, GROUND[1] + 0 * free.q, free.q], axis=-1), atol=1e-6)
 
 
-def test_units_of_constrained_coordinates_do_not_matter():
-    def in_units(q, qdot):  # the first coordinate in millimetres
-        return weight(jnp.stack([q[0] / 1e3, q[1]]), jnp.stack([qdot[0] / 1e3, qdot[1]]))
+def in_units(q, qdot):  # the first coordinate in millimetres
+    return weight(jnp.stack([q[0] / 1e3, q[1]]), jnp.stack([qdot[0] / 1e3, qdot[1]]))
 
+
+SCALED_ROD = lagjax.System(in_units, constraints=lambda q: rod(jnp.stack([q[0] / 1e3, q[1]])))
+
+
+def test_units_of_constrained_coordinates_do_not_matter():
     (q0, qdot0), ts, unit = hung(1.0, 0.5), np.linspace(0, 5, 3), np.array([1e3, 1])
     plain = lagjax.simulate(WEIGHT_ON_A_ROD, q0, qdot0, ts)
-    scaled_rod = lagjax.System(in_units, constraints=lambda q: rod(jnp.stack([q[0] / 1e3, q[1]])))
-    scaled = lagjax.simulate(scaled_rod, q0 * unit, qdot0 * unit, ts)
+    scaled = lagjax.simulate(SCALED_ROD, q0 * unit, qdot0 * unit, ts)
     np.testing.assert_allclose(scaled.q / unit, plain.q, rtol=1e-10, atol=1e-10)
     assert abs(int(scaled.stats["num_accepted_steps"]) - int(plain.stats["num_accepted_steps"])) <= 2
 
@@ -619,21 +638,25 @@ def closed_ladder(q):
     return closed
 
 
+# Six constraints on five coordinates, four of them independent.
+TRUSS = lagjax.System(ladder, constraints=closed_ladder)
+
+
+TORN_TRUSS = lagjax.System(ladder, constraints=lambda q: closed_ladder(q) | {"wrong": q[2] - q[0] - 0.1})
+
+
 @pytest.mark.slow
 def test_a_linkage_held_by_more_bars_than_it_needs():
-    # Six constraints on five coordinates, four of them independent.
-    system = lagjax.System(ladder, constraints=closed_ladder)
     ts, start, lean = np.linspace(0, 0.5, 3), 1.4, GROUND[1]
     free = lagjax.simulate(TURNING_LADDER, start, 0.4, ts, rtol=1e-11)
     q0, qdot0 = np.array([start, lean, start, start, start]), np.array([0.4, 0, 0.4, 0.4, 0.4])
-    run = lagjax.simulate(system, q0, qdot0, ts, rtol=1e-11)
+    run = lagjax.simulate(TRUSS, q0, qdot0, ts, rtol=1e-11)
     np.testing.assert_allclose(run.q, np.stack([free.q, lean + 0 * free.q, *[free.q] * 3], axis=1), atol=1e-9)
     assert drift(run) < DRIFT
-    facts = system.explain(run.q[1], run.qdot[1])
+    facts = TRUSS.explain(run.q[1], run.qdot[1])
     assert len(facts.constraints) == 6 and len(facts.dependent_constraints) == 2
-    torn = lagjax.System(ladder, constraints=lambda q: closed_ladder(q) | {"wrong": q[2] - q[0] - 0.1})
     with pytest.raises(ValueError, match=r"constraints\['wrong'\] contradicts"):
-        lagjax.simulate(torn, run.q[0], run.qdot[0], ts)
+        lagjax.simulate(TORN_TRUSS, run.q[0], run.qdot[0], ts)
 
 
 # ---- derivatives and other transformations ---------------------------------------------------------------------------
@@ -781,13 +804,15 @@ def derivatives_of(function):
     return orders, jax.value_and_grad(orders, has_aux=True)
 
 
+ON_A_CIRCLE = lagjax.System(free_particles, constraints=circle)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("reverse", [False, True])
 def test_projection_has_the_derivatives_of_its_closed_form(reverse):
-    system = lagjax.System(free_particles, constraints=circle)
     found, exact = (
         jax.jit(derivatives_of(of)[reverse])(0.0)
-        for of in (lambda x: jnp.concatenate(system.project(x[:2], x[2:])), nearest_on_circle)
+        for of in (lambda x: jnp.concatenate(ON_A_CIRCLE.project(x[:2], x[2:])), nearest_on_circle)
     )
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(exact), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-14)
@@ -897,6 +922,9 @@ def test_what_is_found_at_zero_is_exact_to_rounding_of_the_terms():
         assert abs(lagjax.equilibrium(LINKS, rest, links).q).max() < 1e-15 * metre
 
 
+NAMED_TWICE = lagjax.System(weight, constraints=lambda q: {"x": q[0]}, velocity_constraints=lambda q, v: {"x": v[1]})
+
+
 def test_signatures_and_names_that_are_refused():
     with pytest.raises(TypeError, match=r"constraints must have the form constraints\(q\)"):
         lagjax.System(weight, constraints=lambda: 0.0)
@@ -904,9 +932,8 @@ def test_signatures_and_names_that_are_refused():
         lagjax.System(weight, constraints=lambda q, qdot: q[0])
     with pytest.raises(TypeError, match=r"velocity_constraints must have the form"):
         lagjax.System(weight, velocity_constraints=lambda q: q[0])
-    twice = lagjax.System(weight, constraints=lambda q: {"x": q[0]}, velocity_constraints=lambda q, v: {"x": v[1]})
     with pytest.raises(ValueError, match="have the same name: x"):
-        twice.acceleration(ORIGIN, REST)
+        NAMED_TWICE.acceleration(ORIGIN, REST)
     for nothing in (lambda q: {}, lambda q: jnp.zeros(0)):
         with pytest.raises(TypeError, match="at least one number"):
             lagjax.System(weight, constraints=nothing).acceleration(ORIGIN, REST)

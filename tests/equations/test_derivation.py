@@ -313,6 +313,9 @@ def test_explain_names_the_engine_that_runs(name, monkeypatch):
         assert facts.path == "scalar" and facts.operations > 0
 
 
+PRODUCTS = lagjax.System(lambda q, v: v[1:] @ v[:-1])
+
+
 def test_a_mass_matrix_that_is_a_series_in_weak_forces_is_positive_definite():
     # Relativity adds G m/(c² r) to masses: with all numbers of order one M is indefinite, and nothing like the scene.
     scene = scenes.solar_system()
@@ -337,7 +340,7 @@ def test_a_mass_matrix_that_is_a_series_in_weak_forces_is_positive_definite():
     np.testing.assert_allclose(np.array(found).T, exact, rtol=1e-13)
     assert not singular.any()
     with pytest.raises(Unlowerable, match="not positive definite"):
-        of(lagjax.System(lambda q, v: v[1:] @ v[:-1]), np.ones(17), np.ones(17)).accelerations.program  # noqa: B018
+        of(PRODUCTS, np.ones(17), np.ones(17)).accelerations.program  # noqa: B018
 
 
 def test_an_indefinite_mass_matrix_that_is_singular_is_found():

@@ -94,6 +94,14 @@ def test_singular_mass_matrix_gives_nan_not_a_number(singular):
     assert np.isnan(lagjax.System(lagrangian).acceleration(np.ones(n), np.ones(n))).all()
 
 
+def oscillator_of_a_pytree(q, qdot):
+    squares = jax.tree.map(lambda x, v: jnp.sum(0.5 * v**2 - 0.5 * 4.0 * x**2), q, qdot)
+    return sum(jax.tree.leaves(squares))
+
+
+OF_A_PYTREE = lagjax.System(oscillator_of_a_pytree)
+
+
 @pytest.mark.parametrize(
     ("q", "qdot"),
     [
@@ -106,11 +114,7 @@ def test_singular_mass_matrix_gives_nan_not_a_number(singular):
     ],
 )
 def test_any_pytree_of_coordinates(q, qdot):
-    def oscillator(q, qdot):
-        squares = jax.tree.map(lambda x, v: jnp.sum(0.5 * v**2 - 0.5 * 4.0 * x**2), q, qdot)
-        return sum(jax.tree.leaves(squares))
-
-    acceleration = lagjax.System(oscillator).acceleration(q, qdot)
+    acceleration = OF_A_PYTREE.acceleration(q, qdot)
     assert jax.tree.structure(acceleration) == jax.tree.structure(q)
     jax.tree.map(lambda a, x: np.testing.assert_allclose(a, -4.0 * jnp.asarray(x), rtol=1e-15), acceleration, q)
 

@@ -66,6 +66,7 @@ def test_bounds_hold_and_cost_effort(example, tmp_path, capsys):
     assert 0.02 * finer.u @ finer.u < 0.04 * free.u @ free.u
 
 
+@pytest.mark.slow
 def test_three_links_balance_on_a_cart(example):
     regulator = example("regulator")
     above, m, length, g = np.array([2.0, 1.0, 0.0]), 0.2, 0.5, 9.81  # rods above each
@@ -99,6 +100,7 @@ def test_innovations_of_the_filter_are_what_it_says(example, monkeypatch):
     assert low < normed[:, -1].mean() < high
 
 
+@pytest.mark.slow
 def test_a_plan_holds_the_pole_where_a_clipped_regulator_drops_it(example, monkeypatch):
     control = example("predictive_control")
     small = np.array([2e-4, -1e-4, 3e-4, 1e-4])

@@ -48,12 +48,12 @@ def save(file, arms):
 def test_a_servo_is_fitted_and_followed_with_another_mass(capsys):
     save("one.npz", [(100.0, 0.5, 0.1), (400.0, 0.5, 0.1), (200.0, 0.3, 0.15)])
     save("other.npz", [(300.0, 0.4, 0.12)])
-    fits, name, errors = importlib.import_module("servo").main(
-        ["one.npz", "--law", "load, sag", "--follow", "other.npz"]
-    )
+    fit, errors = importlib.import_module("servo").main(["one.npz", "--follow", "other.npz"])
     assert capsys.readouterr().out.splitlines()[-1].startswith("followed: 1 recordings, mean absolute error ")
+    assert set(fit.selection.kept) == {"motor", "weight", "sag"}
+    found = fit.params | fit.params["friction"] | fit.params["supply"]
     for key, value in (TRUTH | MORE).items():
-        assert abs(fits[name].params[key] - value) < 0.02 * abs(value) + 2e-4, (key, fits[name].params[key])
+        assert abs(found[key] - value) < 0.02 * abs(value) + 2e-4, (key, found[key])
     assert errors["followed"][0] < 0.5  # mrad: steps of 50 µs are as far from the exact motion
     assert {path.name for path in Path("out").iterdir()} == {"servo_fitted.png", "servo_followed.png"}
 
@@ -61,12 +61,5 @@ def test_a_servo_is_fitted_and_followed_with_another_mass(capsys):
 @pytest.mark.slow
 @pytest.mark.skipif(not REAL.exists(), reason="the recordings of the servo are not here")
 def test_the_real_servo_is_followed_by_its_goals(capsys):
-    _, _, errors = importlib.import_module("servo").main([str(REAL), "--law", "load, sag, rise"])
+    _, errors = importlib.import_module("servo").main([str(REAL)])
     assert np.mean(errors["fitted"]) < 45  # the published laws: 74 to 86
-
-
-def test_the_simplest_law_within_an_error_of_the_best_is_chosen():
-    errors = np.array([[30.0, 31.0, 29.0], [10.0, 12.0, 8.0], [11.0, 11.0, 7.5]])
-    chosen = importlib.import_module("servo").chosen
-    assert chosen([1, 2, 3], errors) == 1  # the third is better by a sixth of a mrad, less than its scatter
-    assert chosen([1, 3, 2], errors) == 2

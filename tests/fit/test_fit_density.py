@@ -132,13 +132,16 @@ def test_gradients_bring_several_systems_to_where_least_squares_do(joint):
     assert fit.log_likelihood == pytest.approx(joint.log_likelihood, abs=0.5)
 
 
+DRIVEN = lagjax.System(energy, forces=lambda q, qdot, t, params: params["push"] * jnp.sin(t))
+
+
 @pytest.mark.slow
 def test_driven_free_and_timed_systems_have_one_density():
     # A driven record, one without inputs, and crossing times of a third system, with Student's noise.
     rng = np.random.default_rng(2)
     driven = np.asarray(
         lagjax.simulate(
-            lagjax.System(energy, forces=lambda q, qdot, t, params: params["push"] * jnp.sin(t)), 0.5, 0.0, TS,
+            DRIVEN, 0.5, 0.0, TS,
             {"k": 4.0, "push": 2.0},
         ).q
     )  # fmt: skip

@@ -268,6 +268,17 @@ def test_what_is_wrong_with_times_of_inputs_is_a_sentence():
         lagjax.fit(SCENE, lagjax.Record(uneven, inputs_of(uneven), {"u": u}), TRUTH, hold="band")
 
 
+def silverbox(q, qdot, params):
+    return 0.5 * qdot**2 - params["k"] * q**2 / 2 - params["k2"] * q**3 / 3 - params["k3"] * q**4 / 4
+
+
+def drive_silverbox(q, qdot, params, inputs):
+    return params["gain"] * inputs - params["c"] * qdot + params["bias"]
+
+
+SILVERBOX = lagjax.System(silverbox, forces=drive_silverbox)
+
+
 @pytest.mark.slow
 def test_a_silverbox_is_known_to_its_noise():
     file = Path(__file__).parents[3] / "shared" / "data" / "silverbox_multisines.npz"
@@ -280,15 +291,8 @@ def test_a_silverbox_is_known_to_its_noise():
     ends, ts = np.array([*begins[1:], len(u)]) - 80, 1e3 / float(data["fs"]) * np.arange(each)  # milliseconds
     records = [lagjax.Record(ts[: b - a], y[a:b], u[a:b], (0.0, 0.0)) for a, b in zip(begins, ends, strict=True)]
 
-    def lagrangian(q, qdot, params):
-        return 0.5 * qdot**2 - params["k"] * q**2 / 2 - params["k2"] * q**3 / 3 - params["k3"] * q**4 / 4
-
-    def forces(q, qdot, params, inputs):
-        return params["gain"] * inputs - params["c"] * qdot + params["bias"]
-
-    scene = lagjax.System(lagrangian, forces=forces)
     first = {"k": 0.19, "c": 0.02, "k2": 0.0, "k3": 0.5, "gain": 0.1, "bias": 0.0}
-    fit = lagjax.fit(scene, records[:2], first, hold="band", method="whole")
+    fit = lagjax.fit(SILVERBOX, records[:2], first, hold="band", method="whole")
     left = np.concatenate([fit.predict(record).residuals for record in records[2:]])
     assert fit.ok and np.sqrt(np.mean(left**2)) < 0.33e-3  # on lines 0.90 mV
 

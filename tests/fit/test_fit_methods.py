@@ -78,15 +78,20 @@ def test_an_interval_that_does_not_exclude_a_bound_ends_there_and_is_no_power_of
     assert (low == [-1.0, -np.inf]).all() and (high == [3.0, np.inf]).all()
 
 
+def masses(q, qdot, params):
+    return 0.5 * jnp.sum(params["m"] * qdot**2) - 0.5 * jnp.sum(q**2) - 0.5 * params["k"] * (q[0] - q[1]) ** 2
+
+
+MASSES = lagjax.System(masses)
+
+
 def test_numbers_of_an_array_are_free_one_by_one():
     # Two masses that swing apart from each other: a factor of all masses and springs is not seen, and one mass is kept.
-    def masses(q, qdot, params):
-        return 0.5 * jnp.sum(params["m"] * qdot**2) - 0.5 * jnp.sum(q**2) - 0.5 * params["k"] * (q[0] - q[1]) ** 2
 
     truth = {"k": 2.0, "m": np.array([1.5, 0.7])}
-    q = lagjax.simulate(lagjax.System(masses), np.array([1.0, -0.3]), np.zeros(2), TS, truth).q
+    q = lagjax.simulate(MASSES, np.array([1.0, -0.3]), np.zeros(2), TS, truth).q
     fit = lagjax.fit(
-        lagjax.System(masses), lagjax.Record(TS, np.asarray(q)), {"k": 2.0, "m": np.array([1.5, 1.0])},
+        MASSES, lagjax.Record(TS, np.asarray(q)), {"k": 2.0, "m": np.array([1.5, 1.0])},
         free={"k": True, "m": np.array([False, True])}, transforms=lagjax.positive,
     )  # fmt: skip
     assert fit.covariance.names == ("params['k']", "params['m'][1]") and fit.ok
@@ -290,15 +295,19 @@ def test_the_gain_of_an_experiment_is_that_of_the_fit_with_its_data():
     assert logs[0] - logs[1] == pytest.approx(table.gain[0], rel=0.2)
 
 
+def magnet(q, v, params):
+    return 0.5 * params["m"] * v**2 - 0.5 * params["k"] * q**2 - jnp.exp(5.0 * (q - 8.0))
+
+
+MAGNET = lagjax.System(magnet)
+
+
 def test_an_experiment_that_sees_what_is_not_seen_comes_first():
     # Free motion tells k/m alone; the force of a magnet at large q tells m.
-    def magnet(q, v, params):
-        return 0.5 * params["m"] * v**2 - 0.5 * params["k"] * q**2 - jnp.exp(5.0 * (q - 8.0))
 
-    scene = lagjax.System(magnet)
-    values = np.asarray(lagjax.simulate(scene, 1.0, 0.0, SHORT, {"m": 1.0, "k": 4.0}).q)
+    values = np.asarray(lagjax.simulate(MAGNET, 1.0, 0.0, SHORT, {"m": 1.0, "k": 4.0}).q)
     one = lagjax.Record(SHORT, values + 0.02 * np.random.default_rng(0).normal(size=values.shape))
-    fit = lagjax.fit(scene, one, {"m": 1.0, "k": 3.0}, transforms=lagjax.positive)
+    fit = lagjax.fit(MAGNET, one, {"m": 1.0, "k": 3.0}, transforms=lagjax.positive)
     assert len(fit.unseen) == 1
     table = fit.next_experiment([plan(9.0), plan(1.0, (7.0, 0.0))])
     assert table.names == ("[1]", "[0]") and table.newly_seen.tolist() == [1, 0]
@@ -358,7 +367,7 @@ def test_gradients_come_to_the_same_as_gauss_and_newton():
     assert "came to rest" in fit.message
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # takes half a minute: the one fit of a network, to all of the example's nine records
 def test_a_network_learns_the_potential_of_its_recordings():
     example = importlib.import_module("learned_potential")
     values, exact, starts = example.recordings()

@@ -95,7 +95,7 @@ def test_it_is_the_fit_of_an_array_that_is_indexed_by_record(offsets):
     assert offsets.params["k"] == pytest.approx(float(by_hand.params["k"]), rel=1e-8)
     np.testing.assert_allclose(offsets.covariance.matrix, by_hand.covariance.matrix, rtol=1e-6)
     assert offsets.log_likelihood == pytest.approx(by_hand.log_likelihood, abs=1e-8)
-    assert offsets.noise["values"].effective == by_hand.noise["values"].effective
+    assert offsets.noise["shifted"].effective == by_hand.noise["values"].effective
 
 
 def test_the_step_is_the_solution_of_the_whole_problem():
@@ -157,8 +157,8 @@ def test_methods_of_the_result_know_the_numbers_of_records(offsets, tmp_path):
 def test_left_out_records_are_fitted_with_numbers_of_their_own(offsets):
     shared = lagjax.fit(SCENE, RECORDS, PARAMS0, observe=shifted, free={**FREE, "offset": True})
     compared = shared.compare({"of each": offsets}, folds=2)
-    assert compared.best == "of each" and compared.left_out[1]["values"] == pytest.approx(2e-3, rel=0.1)
-    assert not shared.ok and shared.rms["values"] > 0.1
+    assert compared.best == "of each" and compared.left_out[1]["shifted"] == pytest.approx(2e-3, rel=0.1)
+    assert not shared.ok and shared.rms["shifted"] > 0.1
 
 
 @pytest.mark.parametrize("transform", [lagjax.positive, lagjax.between(0.1, 5.0)])

@@ -1,6 +1,6 @@
 """Sensors that round, that are at their limits, and samples that are no measurements.
 
-`benchmarks/fit_population.py` counts how often intervals hold the truth. Most tests share one pendulum.
+`benchmarks/coverage.py` counts how often intervals hold the truth. Most tests share one pendulum.
 """
 
 import jax

@@ -294,9 +294,9 @@ def test_a_swing_that_noise_gives_says_nothing_of_its_frequency():
         records = [lagjax.Record(ts, x * exact + 0.005 * rng.normal(size=501), start=start) for x in sizes]
         return lagjax.fit(DAMPED_SWING, records, {"w2": 7.0, "c": 0.2}, transforms=lagjax.positive, noise=law)
 
-    still = [found(0.0) for _ in range(12)] + [found(0.0, law=lagjax.StudentT()), found(0.0, 0.0)]
+    still = [found(0.0) for _ in range(6)] + [found(0.0, law=lagjax.StudentT()), found(0.0, 0.0)]
     assert sum(fit.ok for fit in still) <= 1
     assert all(fit.ok or "params['c'] and params['w2']" in fit.unseen[-1] for fit in still)
-    moving = [found(0.0025) for _ in range(8)]
+    moving = [found(0.0025) for _ in range(4)]
     assert all(not fit.unseen for fit in [*moving, found(0.0, 0.1), found(0.1, law=lagjax.StudentT())])
     assert not any("seen to move" in text for text in found(0.0, start=(0.0, 0.0)).unseen)

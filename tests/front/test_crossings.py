@@ -128,16 +128,18 @@ def test_a_section_in_pieces():
         assert found[name].count <= len(ts) + (name == "a saw")  # and at the very end, to rounding
 
 
+# On a circle from the angle −1 the cut is at 1 + π, and so on; q = t passes the pole of arctan(1/(q − 0.4)) at 0.4.
+POLAR_ORBIT = lagjax.System(lambda q, v: 0.5 * v @ v + 1 / jnp.linalg.norm(q))
+
+
 def test_angles_as_sections():
-    # On a circle from the angle −1 the cut is at 1 + π, and so on; q = t passes the pole of arctan(1/(q − 0.4)) at 0.4.
-    orbit = lagjax.System(lambda q, v: 0.5 * v @ v + 1 / jnp.linalg.norm(q))
     sections = {
         "arctan2": lambda q, v: jnp.arctan2(q[1], q[0]),
         "wrapped": lambda q, v: jnp.mod(jnp.arctan2(q[1], q[0]) + jnp.pi, 2 * jnp.pi) - jnp.pi,
         "arctan": lambda q, v: jnp.arctan(q[1] / q[0]) - 1,
     }
     start, ts = jnp.array([np.cos(1), -np.sin(1)]), jnp.array([0.0, 8.0])
-    found = lagjax.crossings(orbit, sections, start, jnp.array([np.sin(1), np.cos(1)]), ts)
+    found = lagjax.crossings(POLAR_ORBIT, sections, start, jnp.array([np.sin(1), np.cos(1)]), ts)
     expected = {"arctan2": [1, 1 + np.pi, 1 + 2 * np.pi], "arctan": [2, 1 + np.pi / 2, 2 + np.pi, 1 + 3 * np.pi / 2]}
     for name, where in (*expected.items(), ("wrapped", expected["arctan2"])):
         np.testing.assert_allclose(times(found[name])[: len(where)], np.sort(where)[: len(where)], rtol=1e-8)
@@ -189,21 +191,25 @@ def test_a_start_on_the_section():
     assert found.count.tolist() == [1, 1, 1, 0]
 
 
+# The speed has no series at rest: it is looked at a little later. It is t, and crosses 0.3 then.
+FALL = lagjax.System(lambda q, v: 0.5 * v @ v + q[0])
+
+
 @pytest.mark.slow
 def test_a_root_at_the_start():
-    # The speed has no series at rest: it is looked at a little later. It is t, and crosses 0.3 then.
-    fall = lagjax.System(lambda q, v: 0.5 * v @ v + q[0])
     speed = lambda q, v: jnp.sqrt(v @ v) - 0.3
-    found = lagjax.crossings(fall, speed, jnp.zeros(2), jnp.zeros(2), jnp.array([0.0, 1.0]))
+    found = lagjax.crossings(FALL, speed, jnp.zeros(2), jnp.zeros(2), jnp.array([0.0, 1.0]))
     np.testing.assert_allclose(times(found), [0.3], rtol=1e-13)
+
+
+# A pendulum of length 1 in Cartesian coordinates, and its angle.
+ROD = lagjax.System(lambda q, v: 0.5 * v @ v - q[1], constraints=lambda q: q @ q - 1.0)
 
 
 @pytest.mark.slow
 def test_a_constrained_motion():
-    # A pendulum of length 1 in Cartesian coordinates, and its angle.
-    rod = lagjax.System(lambda q, v: 0.5 * v @ v - q[1], constraints=lambda q: q @ q - 1.0)
     start = np.array([np.sin(2.0), -np.cos(2.0)])
-    found = lagjax.crossings(rod, lambda q, v: q[0], start, jnp.zeros(2), jnp.array([0.0, 12.0]), rtol=1e-12)
+    found = lagjax.crossings(ROD, lambda q, v: q[0], start, jnp.zeros(2), jnp.array([0.0, 12.0]), rtol=1e-12)
     quarter = ellipk(np.sin(1.0) ** 2)
     np.testing.assert_allclose(times(found), quarter * np.array([1.0, 3.0, 5.0]), rtol=1e-10)
     np.testing.assert_allclose(found.q[:3], np.outer(np.ones(3), [0.0, -1.0]), atol=1e-12)
@@ -243,25 +249,28 @@ def test_derivatives_by_the_times_and_of_what_is_not_there():
     assert np.isnan(jax.jacrev(first)(ts)[1]).all() and np.isnan(first(ts)[1])
 
 
+# The force is 2 left of 0 and 0 right of it: from −1 at rest, t = 1 and v = 2 at 0; by the start −1/2 and −1.
+PUSHED_BEYOND_ZERO = lagjax.System(lagrangians.free_particle, forces=lambda q, v: jnp.where(q < 0, 2.0, 0.0))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", [jax.jacrev, jax.jacfwd])
 def test_at_a_border_derivatives_are_those_before_it_on_both_sides(mode):
-    # The force is 2 left of 0 and 0 right of it: from −1 at rest, t = 1 and v = 2 at 0; by the start −1/2 and −1.
-    scene = lagjax.System(lagrangians.free_particle, forces=lambda q, v: jnp.where(q < 0, 2.0, 0.0))
-
     def at(q0):
-        found = lagjax.crossings(scene, position, q0, 0.0, jnp.array([0.0, 3.0]), count=1)
+        found = lagjax.crossings(PUSHED_BEYOND_ZERO, position, q0, 0.0, jnp.array([0.0, 3.0]), count=1)
         return jnp.stack([found.t[0], found.qdot[0], found.q[0]])
 
     np.testing.assert_allclose(at(-1.0), [1.0, 2.0, 0.0], atol=1e-14)
     np.testing.assert_allclose(mode(at)(-1.0), [-0.5, -1.0, 0.0], atol=1e-12)
 
 
+TWO_SPRINGS = lagjax.System(lambda q, v: 0.5 * (v["x"] @ v["x"] + v["y"] ** 2) - 0.5 * (q["x"] @ q["x"] + q["y"] ** 2))
+
+
 @pytest.mark.slow
 def test_a_pytree_of_coordinates_and_one_batch():
-    scene = lagjax.System(lambda q, v: 0.5 * (v["x"] @ v["x"] + v["y"] ** 2) - 0.5 * (q["x"] @ q["x"] + q["y"] ** 2))
     run = lambda a: lagjax.crossings(
-        scene, lambda q, v: q["y"], {"x": a * jnp.ones(2), "y": a}, {"x": jnp.zeros(2), "y": 0.0},
+        TWO_SPRINGS, lambda q, v: q["y"], {"x": a * jnp.ones(2), "y": a}, {"x": jnp.zeros(2), "y": 0.0},
         jnp.array([0.0, 5.0]), count=4,
     )  # fmt: skip
     found = jax.jit(jax.vmap(run))(jnp.linspace(0.5, 1.5, 20))

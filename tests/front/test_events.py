@@ -225,5 +225,10 @@ def test_the_result_says_which_of_several_events_ended_the_motion():
     assert lagjax.simulate(scene, 0.0, 1.0, ts).event is None
     with pytest.raises(ValueError, match=r"of 3 functions is for machine code.*jnp.minimum"):
         lagjax.simulate(scene, 0.0, 1.0, ts, event=event, solver=diffrax.Dopri8())
-    one = lagjax.simulate(scene, 0.0, 1.0, ts, event=[event["far"]], solver=diffrax.Dopri8())
+
+
+@pytest.mark.slow
+def test_the_result_of_diffrax_says_that_an_event_ended_the_motion():
+    ts = np.linspace(0.0, 10.0, 3)
+    one = lagjax.simulate(FREE, 0.0, 1.0, ts, event=[lambda q, v: q - 3.0], solver=diffrax.Dopri8())
     assert bool(one.event[0]) and abs(one.end.t - 3) < 1e-9

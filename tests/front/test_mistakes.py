@@ -14,30 +14,41 @@ from scenes import OSCILLATOR, OSCILLATORS, RAMP
 import lagjax
 
 
-def test_a_key_that_is_not_there_is_told_with_those_that_are():
-    def pendulum(q, qdot, params):
-        return 0.5 * qdot["theta"] ** 2 + params["g"] * jnp.cos(q["theta"])
+def pendulum(q, qdot, params):
+    return 0.5 * qdot["theta"] ** 2 + params["g"] * jnp.cos(q["theta"])
 
+
+PENDULUM_WITH_KEYS = lagjax.System(pendulum)
+
+
+def test_a_key_that_is_not_there_is_told_with_those_that_are():
     with pytest.raises(KeyError) as error:
-        lagjax.simulate(lagjax.System(pendulum), {"theta": 1.0}, {"theta": 0.0}, np.arange(3.0), {"G": 9.81})
+        lagjax.simulate(PENDULUM_WITH_KEYS, {"theta": 1.0}, {"theta": 0.0}, np.arange(3.0), {"G": 9.81})
     note = error.value.__notes__[0]
     assert note == (
         "This is pendulum, a function of a scene: it reads a key that is not there: q has 'theta'; params has 'G'."
     )
 
 
+def pendulum_of_a_pair(q, qdot, params):
+    return 0.5 * qdot**2 + params["g"] * jnp.cos(q)
+
+
+PENDULUM_OF_A_PAIR = lagjax.System(pendulum_of_a_pair)
+
+
 @pytest.mark.parametrize("params", [9.81, [9.81]])
 def test_params_of_another_structure_are_told_with_what_reads_them(params):
-    def pendulum(q, qdot, params):
-        return 0.5 * qdot**2 + params["g"] * jnp.cos(q)
-
     with pytest.raises(TypeError) as error:
-        lagjax.simulate(lagjax.System(pendulum), 1.0, 0.0, np.arange(3.0), params)
+        lagjax.simulate(PENDULUM_OF_A_PAIR, 1.0, 0.0, np.arange(3.0), params)
     assert 'it reads `params["g"]`, and the params that it is given are PyTreeDef(' in error.value.__notes__[0]
 
 
+MASS_AS_PARAMS = lagjax.System(lambda q, v, params: 0.5 * params["m"] * v @ v - q @ q)
+
+
 def test_a_sweep_over_a_parameter_without_its_batch_axis_is_told_of_batch_axes():
-    scene = lagjax.System(lambda q, v, params: 0.5 * params["m"] * v @ v - q @ q)
+    scene = MASS_AS_PARAMS
     with pytest.raises(TypeError) as error:
         lagjax.simulate_batch(scene, np.ones((3, 2)), np.zeros((3, 2)), np.arange(3.0), {"m": np.ones(3)})
     assert "By batch_axes this is a batch of 3 members" in error.value.__notes__[-1]

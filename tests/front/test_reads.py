@@ -490,7 +490,9 @@ SPACE = cell("def gain(x): return K * x\ndef L(q, v): return 0.5 * M * v**2 - 0.
 SCENE = lagjax.System(SPACE["L"])
 
 
-SLOW = "simulate by diffrax|a hybrid motion|equilibrium|conserved_quantities|linearize|hamiltonian|normal_modes|action"
+SLOW = (
+    "fit|simulate by diffrax|a hybrid motion|equilibrium|conserved_quantities|linearize|hamiltonian|normal_modes|action"
+)
 
 
 @pytest.mark.parametrize(

@@ -74,18 +74,22 @@ def test_energy_and_momentum_along_the_trajectory():
     np.testing.assert_allclose(trajectory.momentum(), 2.0 * trajectory.qdot, rtol=1e-15)
 
 
+def driven(q, qdot, t):
+    return 0.5 * qdot**2 - 0.5 * (1 + 0.3 * jnp.sin(t)) * q**2
+
+
+DRIVEN = lagjax.System(driven, forces=lambda q, v, t: jnp.cos(3 * t), dissipation=lambda q, v: 0.2 * v**2)
+
+
 def test_power_balance_of_a_driven_and_damped_motion():
     # dh/dt = −∂L/∂t + (Q − ∂D/∂q̇)·q̇, h integrated beside the motion by the trapezoidal rule (error ~ Δt²).
-    def driven(q, qdot, t):
-        return 0.5 * qdot**2 - 0.5 * (1 + 0.3 * jnp.sin(t)) * q**2
 
     def power(q, v, t):
         partial_t = jax.grad(driven, argnums=2)(q, v, t)
         return -partial_t + (jnp.cos(3 * t) - 0.4 * v) * v
 
-    scene = lagjax.System(driven, forces=lambda q, v, t: jnp.cos(3 * t), dissipation=lambda q, v: 0.2 * v**2)
     ts = np.linspace(0.0, 10.0, 4001)
-    trajectory = lagjax.simulate(scene, 1.0, 0.0, ts, rtol=1e-11)
+    trajectory = lagjax.simulate(DRIVEN, 1.0, 0.0, ts, rtol=1e-11)
     rate = np.asarray(jax.jit(jax.vmap(power))(trajectory.q, trajectory.qdot, ts))
     work = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * np.diff(ts))])
     np.testing.assert_allclose(trajectory.energy() - trajectory.energy()[0], work, atol=2e-5)
@@ -360,8 +364,11 @@ def test_sensitivities_of_second_order():
     np.testing.assert_allclose(found, 2 * [of_exact], rtol=1e-8)
 
 
+COUNTED_SPRING = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2)
+
+
 def test_a_call_looks_its_scene_up_once_and_never_remembers_a_number(monkeypatch):
-    scene, asked = lagjax.System(lambda q, qdot, params: 0.5 * qdot**2 - 0.5 * params["k"] * q**2), []
+    scene, asked = COUNTED_SPRING, []
     kept, derivation_of = [], _problem.derivation_of
     monkeypatch.setattr(_problem, "derivation_of", lambda *args: asked.append(1) or derivation_of(*args))
     ts, start, params = np.linspace(0.0, 2.0, 5), np.array(1.0), {"k": np.array(1.0)}

@@ -25,7 +25,7 @@ def exact(ts):
     return np.cos(ts) + 0.5 * np.sin(ts)
 
 
-@pytest.mark.parametrize("kind", sweep(KINDS, kept=KINDS[:1]), ids=lambda kind: type(kind).__name__)
+@pytest.mark.parametrize("kind", sweep(KINDS, kept=KINDS[2:]), ids=lambda kind: type(kind).__name__)
 def test_the_steps_are_those_of_the_solver(kind):
     # Fixed steps: adaptive ones may differ where a decision hangs on the last digit.
     plain, wrapped = (

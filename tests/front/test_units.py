@@ -40,12 +40,16 @@ def test_a_molecule_in_metres_rests_at_its_bond_length():
         lagjax.normal_modes(MOLECULE, 1.3e-10)
 
 
+def turning(q, v, params):
+    return 0.5 * v @ v + params * (q[0] * v[1] - q[1] * v[0]) - 2 * params**2 * (q @ q)
+
+
+TURNING = lagjax.System(turning)
+
+
 @pytest.mark.parametrize("rate", [1e-13, 1e13])
 def test_modes_that_turn_slowly_and_fast(rate):
-    def turning(q, v, params):
-        return 0.5 * v @ v + params * (q[0] * v[1] - q[1] * v[0]) - 2 * params**2 * (q @ q)
-
-    modes = lagjax.normal_modes(lagjax.System(turning), np.zeros(2), rate)
+    modes = lagjax.normal_modes(TURNING, np.zeros(2), rate)
     np.testing.assert_allclose(modes.frequencies / rate, np.sqrt(5) + np.array([-1.0, 1.0]), rtol=1e-13)
 
 
@@ -74,11 +78,15 @@ def test_a_motion_of_an_angstrom_keeps_its_digits():
 # ---- what nearly holds -----------------------------------------------------------------------------------------------
 
 
-def test_a_symmetry_that_nearly_holds_is_named_as_such():
-    def well(q, v, params):
-        return 0.5 * v @ v - 0.5 * (q[0] ** 2 + (1 + params) * q[1] ** 2) - (q @ q) ** 2
+def well(q, v, params):
+    return 0.5 * v @ v - 0.5 * (q[0] ** 2 + (1 + params) * q[1] ** 2) - (q @ q) ** 2
 
-    state = lagjax.System(well), np.array([1.0, 0.3]), np.array([0.3, 0.5])
+
+WELL = lagjax.System(well)
+
+
+def test_a_symmetry_that_nearly_holds_is_named_as_such():
+    state = WELL, np.array([1.0, 0.3]), np.array([0.3, 0.5])
     found = lagjax.conserved_quantities(*state, 1e-9)
     assert [one.name for one in found] == ["energy"]
     assert len(found.notes) == 1 and found.notes[0].startswith("nearly conserved: angular momentum in the plane 01")

@@ -156,7 +156,6 @@ def test_a_bouncing_ball_comes_to_rest_as_the_sentence_advises():
 
 
 def test_blows_at_one_instant_that_do_not_commute_are_said():
-
     def end(side):
         def reset(q, v):
             n, inverse = jnp.stack([1.0, side * jnp.cos(q[1])]), jnp.array([1.0, 3.0])

@@ -549,13 +549,15 @@ def _gap(i):
     return lambda q, v: q[i + 1] - q[i]
 
 
+DROPPED_TOGETHER = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - G * jnp.sum(q))
+
+
 @pytest.mark.slow
 def test_balls_dropped_together_stay_above_the_floor():
-    scene = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - G * jnp.sum(q))
     floors = [lagjax.Transition("a", "a", lambda q, v: q[0], -1, lambda q, v: (q, v.at[0].multiply(-0.9))),
               lagjax.Transition("a", "a", lambda q, v: q[1], -1, lambda q, v: (q, v.at[1].multiply(-0.9)))]  # fmt: skip
     h, e = (x.ravel() for x in np.meshgrid(np.linspace(0.5, 3.0, 40), [0.0, 3e-15, 1e-14, -1e-14, 1e-13, 1e-12]))
-    run = lambda h, e: hybrid({"a": scene}, floors, jnp.stack([h, h * (1 + e)]), jnp.zeros(2), (0.0, 2.0))
+    run = lambda h, e: hybrid({"a": DROPPED_TOGETHER}, floors, jnp.stack([h, h * (1 + e)]), jnp.zeros(2), (0.0, 2.0))
     runs = jax.jit(jax.vmap(run))(h, e)
     alone = jax.jit(jax.vmap(lambda h: bouncing(h, 0.9, ts=jnp.array([0.0, 2.0]))))(h)
     # Rounding of the height, and of the time at the speed of the fall.
@@ -771,6 +773,9 @@ ROD = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q: q[1])
 MASSLESS = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - q[1] ** 2)
 
 
+WITHOUT_MACHINE_CODE = lagjax.System(lambda q, v: v @ v + jax.scipy.special.betainc(2.0, 3.0, q[0]))
+
+
 @pytest.mark.parametrize(
     ("changes", "error", "sentence"),
     [
@@ -792,7 +797,7 @@ MASSLESS = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - q[1] ** 2)
         ({"ts": [0.0, 2.0, 1.0]}, ValueError, "strictly increasing"),
         ({"q0": np.nan}, ValueError, "q0 is nan"),
         (
-            {"modes": {"a": lagjax.System(lambda q, v: v @ v + jax.scipy.special.betainc(2.0, 3.0, q[0]))},
+            {"modes": {"a": WITHOUT_MACHINE_CODE},
              "q0": np.zeros(2), "qdot0": np.zeros(2), "transitions": [stay(guard=lambda q, v: q[0])]},
             ValueError, "'a' has no machine code: .*regularized_incomplete_beta",
         ),
@@ -978,10 +983,13 @@ def test_derivatives_through_modes_that_differ_by_numbers():
     np.testing.assert_allclose(jax.vmap(at_edges)(many), jax.jit(jax.vmap(exact))(many), rtol=1e-12)
 
 
+ON_A_LINE = lagjax.System(free_particle, constraints=lambda q: q - 2.5)
+
+
 def test_modes_of_a_ladder_keep_their_targets_and_constraints():
     modes = {"0": stair(0), "1": stair(1), "2": stair(2), "3": stair(3)}
     edges = [edge(0, target=2), edge(2, target=3), edge(1, target=0)]
-    modes |= {"line": lagjax.System(free_particle, constraints=lambda q: q - 2.5)}
+    modes |= {"line": ON_A_LINE}
     edges += [edge(3, target="line")]
     edges += [lagjax.Transition("line", "1", lambda q, v: q - 9.0)]  # never: it stands still
     run = hybrid(modes, edges, v0=0.2, ts=(0.0, 1.0, 6.0), params=1.3, rtol=1e-12, throw=False)
@@ -993,12 +1001,15 @@ def test_modes_of_a_ladder_keep_their_targets_and_constraints():
         hybrid(modes, edges, v0=0.2, ts=(0.0, 1.0, 6.0), params=1.3, rtol=1e-12)
 
 
+BALL_ALONE = lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)
+
+
 def test_a_reset_without_machine_code_is_named():
     def shorten(q, v):
         return q, jax.lax.while_loop(lambda v: jnp.abs(v) > 1.0, lambda v: 0.5 * v, -v)
 
     bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=shorten)
-    scene = lagjax.Hybrid({"flight": lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)}, [bounce], "flight")
+    scene = lagjax.Hybrid({"flight": BALL_ALONE}, [bounce], "flight")
     with pytest.raises(ValueError, match=r"with the reset .*shorten.*while"):
         lagjax.simulate(scene, 1.0, 0.0, np.linspace(0.0, 1.0, 3))
 
@@ -1021,5 +1032,5 @@ def test_short_motions_from_a_traced_mode_on_are_one_motion_in_a_batch():
         return lagjax.simulate(scene, q0, 0.0, jnp.array([0.0, 3.0]), throw=False).q[-1]
 
     starts = np.linspace(0.8, 1.2, 4)
-    given, expected = (jax.vmap(jax.value_and_grad(of))(starts) for of in (in_parts, whole))
+    given, expected = (jax.jit(jax.vmap(jax.value_and_grad(of)))(starts) for of in (in_parts, whole))
     np.testing.assert_allclose(given, expected, rtol=1e-9)

@@ -263,16 +263,19 @@ def test_derivatives_of_a_jump_beside_every_operation(jump, operations):
         np.testing.assert_allclose(reverse[k], forward, atol=1e-7)
 
 
+def force_by_roots_and_angles(q, v, params):
+    inside = jnp.where(jnp.linalg.norm(q) > 1.3, 1.0, -1.0) + jnp.where(jnp.arctan2(q[1], q[0]) > 0.5, 0.4, 0.0)
+    return params * inside * jnp.array([-q[1], q[0]]) - 0.1 * v
+
+
+ROOTS_AND_ANGLES = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q, forces=force_by_roots_and_angles)
+
+
 def test_borders_by_roots_and_angles_in_every_mode():
     # A number by which a force is pieced together may have an infinite slope elsewhere, as a distance has at zero.
-    def force(q, v, params):
-        inside = jnp.where(jnp.linalg.norm(q) > 1.3, 1.0, -1.0) + jnp.where(jnp.arctan2(q[1], q[0]) > 0.5, 0.4, 0.0)
-        return params * inside * jnp.array([-q[1], q[0]]) - 0.1 * v
-
-    scene = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q, forces=force)
 
     def end(x):
-        run = lagjax.simulate(scene, np.array([1.0, 0.3]), x[1:], np.array([0.0, 6.0]), x[0])
+        run = lagjax.simulate(ROOTS_AND_ANGLES, np.array([1.0, 0.3]), x[1:], np.array([0.0, 6.0]), x[0])
         return run.q[-1, 0]
 
     x, step = np.array([0.5, -1.2, 2.3]), 1e-6 * np.eye(3)
@@ -300,10 +303,21 @@ def test_a_jump_beside_a_root_that_is_singular_elsewhere(slow):
             np.testing.assert_allclose(jax.jit(mode(end))(x), differences, rtol=1e-7, atol=1e-7)
 
 
+def height_of_wire(x):
+    return jnp.where(x < 0.3, 0.0, (x - 0.3) ** 2)
+
+
+def slope_of_wire(x):
+    return jnp.where(x < 0.3, 0.0, 2 * (x - 0.3))
+
+
+BEAD_ALONE = lagjax.System(lambda x, v: 0.5 * (1 + slope_of_wire(x) ** 2) * v**2 - 9.81 * height_of_wire(x))
+
+
 @pytest.mark.parametrize(
     ("kind", "derivative"),
     [
-        ("constraints", jax.jacrev),
+        pytest.param("constraints", jax.jacrev, marks=pytest.mark.slow),
         ("contacts", jax.jacfwd),
         pytest.param("constraints", jax.jacfwd, marks=pytest.mark.slow),
         pytest.param("contacts", jax.jacrev, marks=pytest.mark.slow),
@@ -312,20 +326,12 @@ def test_a_jump_beside_a_root_that_is_singular_elsewhere(slow):
 )
 def test_a_bead_passes_where_the_curvature_of_its_wire_jumps(kind, derivative):
     """As in its one coordinate, where no projection decides by rounding on which side of the border it is."""
-
-    def height(x):
-        return jnp.where(x < 0.3, 0.0, (x - 0.3) ** 2)
-
-    def slope(x):
-        return jnp.where(x < 0.3, 0.0, 2 * (x - 0.3))
-
-    wire = lagjax.System(lambda q, v: 0.5 * v @ v - 9.81 * q[1], **{kind: lambda q: q[1] - height(q[0])})
-    alone = lagjax.System(lambda x, v: 0.5 * (1 + slope(x) ** 2) * v**2 - 9.81 * height(x))
+    wire = lagjax.System(lambda q, v: 0.5 * v @ v - 9.81 * q[1], **{kind: lambda q: q[1] - height_of_wire(q[0])})
 
     def ends(speed, duration):
         ts, still = jnp.stack([0.0 * duration, duration]), 0.0 * speed
         bead = lagjax.simulate(wire, jnp.array([0.24, 0.0]), jnp.stack([speed, still]), ts, rtol=1e-13)
-        return jnp.stack([bead.q[-1, 0], lagjax.simulate(alone, 0.24, speed, ts, rtol=1e-13).q[-1]])
+        return jnp.stack([bead.q[-1, 0], lagjax.simulate(BEAD_ALONE, 0.24, speed, ts, rtol=1e-13).q[-1]])
 
     durations = np.array([0.205, 0.21, 0.22, 0.24, 0.25, 0.28, 0.3])
     along = jax.jit(jax.vmap(derivative(ends), (None, 0)))(0.3, durations)

@@ -84,15 +84,18 @@ def test_in_single_precision():
         np.testing.assert_allclose(slopes["v"][:, :2], 0.0, atol=1e-6)
 
 
+ALONG_THE_BORDER = lagjax.System(
+    lambda q, v: 0.5 * v * v,
+    forces=lambda q, v, params: -3.0 * jnp.sign(v + params[0] * q) - params[1] * q,
+)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("outer", [jax.jacfwd, jax.jacrev])
 @pytest.mark.parametrize("inner", [jax.jacfwd, jax.jacrev])
 def test_second_derivatives_exist_along_the_border_alone(inner, outer):
     def end(x):  # slope of the sliding mode, stiffness, velocity at the start
-        scene = lagjax.System(
-            lambda q, v: 0.5 * v * v,
-            forces=lambda q, v, params: -3.0 * jnp.sign(v + params[0] * q) - params[1] * q,
-        )
+        scene = ALONG_THE_BORDER
         return lagjax.simulate(scene, x[3], x[2], TS, x[:2]).q[-1]
 
     second = jax.jit(outer(inner(end)))(jnp.array([1.0, 0.5, -1.0, 1.0]))
@@ -162,10 +165,13 @@ def stack(q, v, params):
     return params[1] * jnp.array([0.5, 1.0, -0.3]) - friction + jnp.append(friction[1:], 0.0)
 
 
+STACK = lagjax.System(lambda q, v: 0.5 * v @ (jnp.array([1.0, 2.0, 0.7]) * v), forces=stack)
+
+
 def test_nothing_that_rests_creeps():
     """Motions at rest, or on a belt, for 1e8 units of time. Compiles one batch of motions."""
     random = np.random.default_rng(0)
-    scene, count = lagjax.System(lambda q, v: 0.5 * v @ (jnp.array([1.0, 2.0, 0.7]) * v), forces=stack), 200
+    scene, count = STACK, 200
     mu = random.uniform(0.5, 5.0, count)
     speeds = np.where(np.arange(count) < 100, 0.0, random.uniform(-2.0, 2.0, count))
     params = np.asarray(np.stack([mu, 0.9 * mu * random.uniform(-1.0, 1.0, count), speeds], axis=1))
@@ -210,13 +216,16 @@ LAWS = [
 ]
 
 
+AS_WRITTEN = lagjax.System(
+    lambda q, v: 0.5 * v @ v, forces=lambda q, v: jnp.stack([f(q[i]) for i, (f, *_) in enumerate(LAWS)])
+)
+
+
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_a_law_that_jumps_is_as_it_is_written_where_a_motion_begins_at_rest(dtype):
     """Compiles one motion."""
     with jax.enable_x64(dtype == np.float64):
-        system = lagjax.System(
-            lambda q, v: 0.5 * v @ v, forces=lambda q, v: jnp.stack([f(q[i]) for i, (f, *_) in enumerate(LAWS)])
-        )
+        system = AS_WRITTEN
         starts, moves = np.array([[start, moved] for _, start, moved in LAWS], dtype).T
         run = lagjax.simulate(system, starts, 0 * starts, np.array([0.0, 1.0], dtype))
     np.testing.assert_allclose(2 * (run.q[-1] - starts), moves, atol=100 * np.finfo(dtype).eps)

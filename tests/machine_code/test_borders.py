@@ -228,7 +228,6 @@ def test_what_powers_make_narrow_is_seen_by_guards_and_derivatives(width):
 
 
 def test_an_atom_is_hit_from_any_distance():
-
     def rate(t, y):
         return [*y[2:], *(48 * (y[:2] @ y[:2]) ** -7 - 24 * (y[:2] @ y[:2]) ** -4) * y[:2]]
 
@@ -297,7 +296,7 @@ def difference(f, x, h):
 
 
 # A jump, a corner, a border of the parameters and one of the velocity; the rest are more of these kinds.
-SHOWN = ("a region is entered", "a corner, by where it starts", "a saturated spring", "a border that moves", "friction")
+SHOWN = ("a region is entered", "a border that moves", "friction")
 
 
 @pytest.mark.parametrize("name", sweep(DERIVATIVES, kept=SHOWN))
@@ -375,10 +374,10 @@ def test_derivatives_of_a_motion_that_sticks():
         return last_q(BLOCK, q0, 0.0, 20.0, mu)
 
     for derivative in (jax.grad, jax.jacfwd):  # the end is −(q0 − 6 μ)
-        np.testing.assert_allclose(derivative(q, (0, 1))(2.0, 0.3), [-1.0, 6.0], rtol=1e-8)
-    mu = 0.31
+        np.testing.assert_allclose(jax.jit(derivative(q, (0, 1)))(2.0, 0.3), [-1.0, 6.0], rtol=1e-8)
+    mu, slope = 0.31, jax.jit(jax.grad(q, 1))
     for _ in range(3):  # Newton's method for the friction with which it stops at −0.1
-        mu -= (q(2.0, mu) + 0.1) / jax.grad(q, 1)(2.0, mu)
+        mu -= (q(2.0, mu) + 0.1) / slope(2.0, mu)
     np.testing.assert_allclose(mu, 1.9 / 6, atol=1e-9)
 
 
@@ -456,7 +455,7 @@ AT_ONE_INSTANT = {
 }
 
 
-@pytest.mark.parametrize("name", AT_ONE_INSTANT)
+@pytest.mark.parametrize("name", sweep(AT_ONE_INSTANT, kept=("a sawtooth of both signs", "stairs on a sawtooth")))
 def test_derivatives_where_several_borders_lie_at_one_instant(name):
     scene = lagjax.System(free_particle, forces=AT_ONE_INSTANT[name])
 
@@ -499,7 +498,7 @@ def test_a_cradle_of_hertzian_contacts_that_touch_is_struck(rtol, unit):
     ("count", "gap", "power"),
     sweep(
         [(2, 0.0, 1.5), (3, 0.0, 1.5), (3, 1e-6, 1.5), (3, 0.0, 1.0), (3, 0.0, 2.0)],
-        kept=[(2, 0.0, 1.5), (3, 0.0, 1.0)],
+        kept=[(3, 0.0, 1.0)],
     ),
 )
 def test_derivatives_of_a_cradle_that_is_struck(count, gap, power):
@@ -535,5 +534,5 @@ def test_derivatives_of_a_cradle_that_is_struck(count, gap, power):
 def test_balls_at_rest_that_touch_have_derivatives_by_where_they_are():
     """By Hertz's law, whose slope is zero there."""
     for of in (jax.jacfwd, jax.jacrev):
-        found = of(lambda q: lagjax.simulate(HERTZ, q, jnp.zeros(2), jnp.array([0.0, 1.0])).q[-1])(np.zeros(2))
+        found = jax.jit(of(lambda q: lagjax.simulate(HERTZ, q, np.zeros(2), np.array([0.0, 1.0])).q[-1]))(np.zeros(2))
         np.testing.assert_array_equal(found, np.eye(2))

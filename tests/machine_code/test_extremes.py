@@ -28,21 +28,24 @@ def test_times_next_to_each_other_end():
 # ---- motions that die out --------------------------------------------------------------------------------------------
 
 
-def test_motions_that_die_out_towards_a_corner():
-    def drag(q, v, params):
-        a, b, width = params
-        air = -a * v[0] - b * jnp.abs(v[0]) * v[0]
-        dead_zone = -jnp.where(jnp.abs(q[1]) < 0.5, 0.0, q[1] - 0.5 * jnp.sign(q[1])) - 3 * v[1]
-        return jnp.array([air, dead_zone, -v[2] / (jnp.abs(v[2]) + width), -5 * v[3] - 0.1 * jnp.abs(v[3]) * v[3]])
+def drag(q, v, params):
+    a, b, width = params
+    air = -a * v[0] - b * jnp.abs(v[0]) * v[0]
+    dead_zone = -jnp.where(jnp.abs(q[1]) < 0.5, 0.0, q[1] - 0.5 * jnp.sign(q[1])) - 3 * v[1]
+    return jnp.array([air, dead_zone, -v[2] / (jnp.abs(v[2]) + width), -5 * v[3] - 0.1 * jnp.abs(v[3]) * v[3]])
 
+
+DRAGGED = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q[3] ** 2, forces=drag)
+
+
+def test_motions_that_die_out_towards_a_corner():
     def end(params, duration):
-        return lagjax.simulate(system, *start, np.array([0.0, duration]), params)
+        return lagjax.simulate(DRAGGED, *start, np.array([0.0, duration]), params)
 
     def rest(params):
         a, b, width = params
         return jnp.array([jnp.log1p(b / a) / b, 0.5, 0.5 + width, 0.0])
 
-    system = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q[3] ** 2, forces=drag)
     start, params = (np.array([0.0, 1.0, 0.0, 1.0]), np.array([1.0, 0.0, 1.0, 0.0])), np.array([1.0, 0.7, 0.1])
     found = end(params, 1000.0)
     np.testing.assert_allclose(found.q[-1], jax.jit(rest)(params), atol=1e-9)
@@ -117,17 +120,20 @@ def test_rates_whose_powers_overflow_on_the_way():
     np.testing.assert_allclose(end(1e-10, 1e-13), end(1.0, 1.0), rtol=1e-8)
 
 
+def force_by_exponentials(q, v, params):
+    beyond = jnp.where(q > 0.3, 1 / (1 + jnp.exp(5 * q)), -1.0 / jnp.cosh(params * q) ** 2)
+    return beyond - jnp.tanh(jnp.exp(q)) * jnp.floor(2 * q)
+
+
+BY_EXPONENTIALS = lagjax.System(lambda q, v: 0.5 * v**2 - 0.1 * jnp.log(1 + jnp.exp(q)), forces=force_by_exponentials)
+
+
 def test_slopes_over_borders_of_functions_of_exponentials():
     """Behind a border, too, and in reverse: what masks an overflow there asks of values, not of tangents."""
 
-    def force(q, v, params):
-        beyond = jnp.where(q > 0.3, 1 / (1 + jnp.exp(5 * q)), -1.0 / jnp.cosh(params * q) ** 2)
-        return beyond - jnp.tanh(jnp.exp(q)) * jnp.floor(2 * q)
-
     def end(x):
-        return lagjax.simulate(system, x[0], x[1], jnp.array([0.0, 3.0]), x[2]).q[-1]
+        return lagjax.simulate(BY_EXPONENTIALS, x[0], x[1], jnp.array([0.0, 3.0]), x[2]).q[-1]
 
-    system = lagjax.System(lambda q, v: 0.5 * v**2 - 0.1 * jnp.log(1 + jnp.exp(q)), forces=force)
     x = np.array([-0.4, 1.3, 1.0])
     differences = [(end(x + 1e-6 * e) - end(x - 1e-6 * e)) / 2e-6 for e in np.eye(3)]
     np.testing.assert_allclose(jax.grad(end)(x), differences, rtol=1e-6)

@@ -104,7 +104,7 @@ def agree(here, there, tolerance=1e-9):
 
 @pytest.mark.parametrize(
     "form",  # that of its own is unrolled, of a lower order
-    [None, pytest.param(GpuForm(13, unrolled=True), marks=pytest.mark.slow), GpuForm(13, unrolled=False)],
+    [None, *(pytest.param(GpuForm(13, unrolled=x), marks=pytest.mark.slow) for x in (True, False))],
 )
 def test_a_batch_is_that_of_the_cpu(on_the_ptx, monkeypatch, form):
     scene = scenes.double_pendulum()
@@ -143,6 +143,9 @@ def test_every_member_may_have_its_own_times_and_parameters(on_the_ptx):
     agree(on_the_ptx(jax.vmap(one), ends, params), jax.jit(jax.vmap(one))(ends, params))
 
 
+VANISHING_MASS = lagjax.System(lambda q, qdot: 0.5 * q * qdot**2 - q)
+
+
 def test_a_failure_has_the_result_of_the_cpu(on_the_ptx):
     scene = scenes.double_pendulum()
 
@@ -150,7 +153,7 @@ def test_a_failure_has_the_result_of_the_cpu(on_the_ptx):
         return motion(scene, q0, 0 * q0, 100.0 * TS, max_steps=9)
 
     def singular(q0):  # a mass that vanishes
-        system = lagjax.System(lambda q, qdot: 0.5 * q * qdot**2 - q)
+        system = VANISHING_MASS
         return motion(system, q0, 0.0)
 
     for run, start in ((spent, scene.q0), (singular, 0.0)):
@@ -194,11 +197,13 @@ def test_derivatives_with_constraints(on_the_ptx):
         agree(on_the_ptx(function, *given), jax.jit(function)(*given), 1e-8)
 
 
+PIECEWISE = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
+
+
 @pytest.mark.slow
 def test_borders_of_a_piecewise_scene(on_the_ptx):
-    system = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
-    here = on_the_ptx(lambda q0: motion(system, q0, 0.0, 5.0 * TS), 1.0)
-    agree(here, jax.jit(lambda q0: motion(system, q0, 0.0, 5.0 * TS))(1.0))
+    here = on_the_ptx(lambda q0: motion(PIECEWISE, q0, 0.0, 5.0 * TS), 1.0)
+    agree(here, jax.jit(lambda q0: motion(PIECEWISE, q0, 0.0, 5.0 * TS))(1.0))
 
 
 @pytest.mark.slow
@@ -241,7 +246,8 @@ def test_members_whose_steps_do_not_do_take_tangents(on_the_ptx, monkeypatch):
     assert sorted(on_the_ptx.launches) == [3, 3, 15]
 
 
-def test_gradients_of_motions_that_fail_are_those_of_the_cpu(on_the_ptx):
+@pytest.mark.parametrize("of", [pytest.param("outputs", marks=pytest.mark.slow), "end"])
+def test_gradients_of_motions_that_fail_are_those_of_the_cpu(on_the_ptx, of):
     q0, far = np.array([0.01, 2.0]), 20.0 * TS
 
     def of_outputs(q0):
@@ -251,24 +257,26 @@ def test_gradients_of_motions_that_fail_are_those_of_the_cpu(on_the_ptx):
     def of_end(q0):
         return motion(scenes.pendulum(), q0, 0.0, far, max_steps=30, rtol=1e-9)[0][-1]
 
-    for function in (of_outputs, of_end):
-        gradient = jax.vmap(jax.grad(function))
-        here, there = on_the_ptx(gradient, q0), jax.jit(gradient)(q0)
-        np.testing.assert_array_equal(np.isnan(here), np.isnan(there))
-        agree(here, there, 1e-6)
-    assert np.isnan(there).any()
+    gradient = jax.vmap(jax.grad(of_end if of == "end" else of_outputs))
+    here, there = on_the_ptx(gradient, q0), jax.jit(gradient)(q0)
+    np.testing.assert_array_equal(np.isnan(here), np.isnan(there))
+    agree(here, there, 1e-6)
+    assert np.isnan(there).any() == (of == "end")
+
+
+FALLING = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
+QUARTIC = lagjax.System(lambda q, v: 0.5 * v**2 - q**4)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["few", "many", "no numbers", "borders", "in memory", "own times"])
 def test_transposes(on_the_ptx, case):
     chain, pendulum, ends = scenes.chain(4), scenes.pendulum(), np.arange(-1.0, 2.0)  # back, not at all, and on
-    falling = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
     derivative, given = {
         "few": (jax.jacrev(lambda q0: motion(pendulum, q0, 0.0)[0][1:3]), (1.0,)),
         "many": (jax.jacrev(lambda q0: motion(pendulum, q0, 0.0)[0]), (1.0,)),
-        "no numbers": (jax.grad(lambda q0: swung(q0, lagjax.System(lambda q, v: 0.5 * v**2 - q**4))), (1.0,)),
-        "borders": (jax.grad(lambda q0: swung(q0, falling, 5.0 * TS)), (1.0,)),
+        "no numbers": (jax.grad(lambda q0: swung(q0, QUARTIC)), (1.0,)),
+        "borders": (jax.grad(lambda q0: swung(q0, FALLING, 5.0 * TS)), (1.0,)),
         "in memory": (jax.grad(lambda q0, p: swung(q0, chain, params=p), (0, 1)), (chain.q0, chain.params)),
         "own times": (jax.vmap(jax.grad(lambda q0, end: swung(q0, ts=end * TS), (0, 1))), (np.ones(3), ends)),
     }[case]  # fmt: skip
@@ -306,10 +314,12 @@ def in_single(scene, q0, ts=TS, **how):
     return run.q, run.qdot, run.result._value
 
 
+DRIVEN_IN_TIME = lagjax.System(lambda q, qdot, t, params: 0.5 * qdot**2 + q * jnp.cos(params["w"] * t))
+
+
 def test_the_time_of_single_precision_is_a_double(on_the_ptx):
     """After a thousand turns of the drive it has four digits as a float: the force would be wrong by a hundredth."""
-    system = lagjax.System(lambda q, qdot, t, params: 0.5 * qdot**2 + q * jnp.cos(params["w"] * t))
-    scene = SimpleNamespace(system=system, qdot0=0.0, params={"w": 3.7})
+    scene = SimpleNamespace(system=DRIVEN_IN_TIME, qdot0=0.0, params={"w": 3.7})
 
     def driven(q0):
         return in_single(scene, q0, 2000.0 + TS)[:2]
@@ -330,9 +340,12 @@ def test_derivatives_of_single_precision(on_the_ptx):
     assert on_the_ptx.launches == [3, 3, 3]  # the motion, there and back; and the motion with its tangents
 
 
+WEDGE = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
+
+
 @pytest.mark.slow
 def test_borders_and_events_are_found_in_doubles(on_the_ptx):
-    wedge = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
+    wedge = WEDGE
     wedge = SimpleNamespace(system=wedge, qdot0=0.0, params=None)
 
     def to_event(q0):
@@ -392,8 +405,15 @@ ONE_OF_A_KIND = (
 # ---- the lowering ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dtype", [pytest.param(np.float32, marks=pytest.mark.slow), np.float64])
-def test_the_lowering_launches_and_calls_nothing_else(dtype):
+@pytest.mark.parametrize(
+    ("dtype", "count"),
+    [
+        (np.float64, 3),
+        pytest.param(np.float32, None, marks=pytest.mark.slow),
+        pytest.param(np.float64, None, marks=pytest.mark.slow),
+    ],
+)
+def test_the_lowering_launches_and_calls_nothing_else(dtype, count):
     scene = scenes.pendulum()
     params = jax.tree.map(dtype, scene.params)
 
@@ -411,11 +431,12 @@ def test_the_lowering_launches_and_calls_nothing_else(dtype):
     mesh = AbstractMesh((4,), ("members",))
     on_four_gpus = jax.shard_map(jax.vmap(one), mesh=mesh, in_specs=over, out_specs=over)
     # A gradient needs the motion itself, its transpose, and tangents where the steps of that do not do.
-    for function, q0, calls in (
-        (one, one_member, 1), (jax.vmap(one), many, 1), (to_event, one_member, None), (jax.grad(one), one_member, 3),
-        (jax.vmap(jax.grad(one)), many, 3), (jax.hessian(one), one_member, None), (repeated, one_member, 1),
-        (on_four_gpus, many, 1),
-    ):  # fmt: skip
+    every = (
+        (jax.vmap(one), many, 1), (jax.vmap(jax.grad(one)), many, 3), (on_four_gpus, many, 1), (one, one_member, 1),
+        (jax.grad(one), one_member, 3), (to_event, one_member, None), (jax.hessian(one), one_member, None),
+        (repeated, one_member, 1),
+    )  # fmt: skip
+    for function, q0, calls in every[:count]:
         text = jax.export.export(jax.jit(function), platforms=["cuda"], disabled_checks=[
             jax.export.DisabledSafetyCheck.custom_call("__gpu$xla.gpu.ptx")])(q0).mlir_module()  # fmt: skip
         assert "callback" not in text

@@ -68,12 +68,12 @@ def test_a_potential_by_a_table_of_parameters(count):
     # borders the slopes by entries, of pieces a thousandth long, lose three digits of sixteen.
     scene, params = VALLEY, table(count)
     np.testing.assert_allclose(end_of(scene, params, solver=MACHINE), exact_end(params), atol=1e-11)
-    slopes, closed = jax.grad(lambda p: end_of(scene, p))(params), jax.jit(jax.grad(exact_end))(params)
+    slopes, closed = (jax.jit(jax.grad(f))(params) for f in (lambda p: end_of(scene, p), exact_end))
     for name in "xu":
         assert np.abs(closed[name]).max() > 0.1 / count
         np.testing.assert_allclose(slopes[name], closed[name], atol=1e-10)
-    along = {name: jnp.cos(jnp.arange(count)) for name in "xu"}
-    forward = jax.jvp(lambda p: end_of(scene, p), (params,), (along,))[1]
+    along = {name: np.cos(np.arange(count)) for name in "xu"}
+    forward = jax.jit(lambda p: jax.jvp(lambda p: end_of(scene, p), (p,), (along,))[1])(params)
     np.testing.assert_allclose(forward, sum(np.vdot(closed[name], along[name]) for name in "xu"), atol=1e-9)
 
 
@@ -206,25 +206,28 @@ def test_a_step_by_digitize(right):
         np.testing.assert_allclose(found[1], known[1], atol=1e-10)
 
 
+def force_of_field(q, qdot, params):
+    return -q - jnp.stack([height_of_field(params["x"], params["y"], g, *q) for g in (params["g"], params["g"].T)])
+
+
+def height_of_field(x, y, g, a, b):
+    i, j = (jnp.clip(jnp.searchsorted(k, z, side="right") - 1, 0, len(k) - 2) for k, z in ((x, a), (y, b)))
+    s, t = (a - x[i]) / (x[i + 1] - x[i]), (b - y[j]) / (y[j + 1] - y[j])
+    low, high = (1 - t) * g[i, j] + t * g[i, j + 1], (1 - t) * g[i + 1, j] + t * g[i + 1, j + 1]
+    return (1 - s) * low + s * high
+
+
+ON_A_GRID = lagjax.System(free_particles, forces=force_of_field)
+
+
 @pytest.mark.slow
 def test_a_field_on_a_grid():
     """Bilinear between knots of two axes; axes and heights that are not separable, by differences."""
-
-    def height(x, y, g, a, b):
-        i, j = (jnp.clip(jnp.searchsorted(k, z, side="right") - 1, 0, len(k) - 2) for k, z in ((x, a), (y, b)))
-        s, t = (a - x[i]) / (x[i + 1] - x[i]), (b - y[j]) / (y[j + 1] - y[j])
-        low, high = (1 - t) * g[i, j] + t * g[i, j + 1], (1 - t) * g[i + 1, j] + t * g[i + 1, j + 1]
-        return (1 - s) * low + s * high
-
-    def force(q, qdot, params):
-        return -q - jnp.stack([height(params["x"], params["y"], g, *q) for g in (params["g"], params["g"].T)])
-
-    scene = lagjax.System(free_particles, forces=force)
     params = {"x": jnp.asarray(KNOTS), "y": jnp.asarray(KNOTS + 0.03), "g": jnp.outer(VALUES, VALUES**2)}
 
     def end(p):
         ts = jnp.array([0.0, 2.0])
-        return lagjax.simulate(scene, jnp.array([-0.3, 0.2]), jnp.array([0.8, 0.5]), ts, p, solver=MACHINE).q[-1, 0]
+        return lagjax.simulate(ON_A_GRID, jnp.array([-0.3, 0.2]), jnp.array([0.8, 0.5]), ts, p, solver=MACHINE).q[-1, 0]
 
     slopes = jax.grad(end)(params)
     for name in params:
@@ -248,20 +251,24 @@ def test_a_table_of_any_length_is_looked_up(where):
     np.testing.assert_allclose(run.q[-1], 1.2**3 / 6, rtol=1e-12)
 
 
+def chosen_coordinate(q, qdot, params):
+    chosen = q[params["i"]]
+    return 0.5 * jnp.sum(qdot**2) - 0.5 * jnp.sum(chosen**2) - 0.2 * jnp.sum(chosen * q[params["j"]])
+
+
+CHOSEN_COORDINATE = lagjax.System(chosen_coordinate)
+
+
 @pytest.mark.parametrize("place", [0, 2])
 def test_a_coordinate_that_params_choose_is_differentiated_by(place):
     """Σ q[i]² and a product of two such entries: a look-up into the state itself has a slope by what it reads."""
     i, j, q = np.array([place, 1]), np.array([4, 3]), np.array([0.3, -0.7, 1.1, 0.4, -0.2])
 
-    def lagrangian(q, qdot, params):
-        chosen = q[params["i"]]
-        return 0.5 * jnp.sum(qdot**2) - 0.5 * jnp.sum(chosen**2) - 0.2 * jnp.sum(chosen * q[params["j"]])
-
     stiffness = np.zeros((5, 5))
     np.add.at(stiffness, (i, i), 1.0)
     np.add.at(stiffness, (i, j), 0.2)
     np.add.at(stiffness, (j, i), 0.2)
-    scene, params = lagjax.System(lagrangian), {"i": i, "j": j}
+    scene, params = CHOSEN_COORDINATE, {"i": i, "j": j}
     np.testing.assert_allclose(scene.acceleration(q, 0 * q, 0.0, params), -stiffness @ q, rtol=0, atol=1e-15)
     run = lagjax.simulate(scene, q, 0 * q, END, params, solver=MACHINE)
     values, modes = np.linalg.eigh(stiffness)

@@ -346,7 +346,6 @@ def test_steps_of_diffrax_end_at_knots(backward):
 
 @pytest.mark.slow
 def test_interpolation_of_jax_is_known():
-
     def end(values):
         return lagjax.simulate(INTERPOLATED, 0.3, 0.1, END, values, solver=MACHINE).q[-1]
 
@@ -378,16 +377,18 @@ def test_terrain_by_the_floor_of_a_place():
     np.testing.assert_allclose(jax.grad(end)(np.asarray(heights)), differences, atol=1e-8)
 
 
+def force_beyond_samples(q, qdot, t, params):
+    side = jnp.where(q > lagjax.samples(params["t"], params["u"], "linear")(t), 1.0, -1.0)
+    return 0.3 * side - 0.05 * qdot
+
+
+FOLLOWED_BORDER = lagjax.System(oscillator, forces=force_beyond_samples)
+
+
 @pytest.mark.slow
 def test_a_border_that_follows_samples():
-    def force(q, qdot, t, params):
-        side = jnp.where(q > lagjax.samples(params["t"], params["u"], "linear")(t), 1.0, -1.0)
-        return 0.3 * side - 0.05 * qdot
-
-    scene = lagjax.System(oscillator, forces=force)
-
     def end(knots, values):
-        return lagjax.simulate(scene, 1.0, 0.0, END, {"t": knots, "u": values}, solver=MACHINE).q[-1]
+        return lagjax.simulate(FOLLOWED_BORDER, 1.0, 0.0, END, {"t": knots, "u": values}, solver=MACHINE).q[-1]
 
     x, u = np.asarray(KNOTS), np.asarray(0.5 * VALUES)
     for k, f in enumerate((lambda x: end(x, u), lambda u: end(x, u))):
@@ -414,18 +415,20 @@ def test_a_block_on_a_belt_whose_speed_is_sampled():
     np.testing.assert_allclose(slopes, (np.array(ends) - run.q[-1]) / 1e-5, atol=1e-4)
 
 
+def driven_pivot(q, t, params):
+    return jnp.sum((q - jnp.stack([lagjax.samples(KNOTS, params, "cubic")(t), 0.0])) ** 2) - 1.0
+
+
+DRIVEN_PIVOT = lagjax.System(weight, constraints=driven_pivot)
+
+
 @pytest.mark.slow
 def test_a_constraint_that_samples_drive():
     values = np.concatenate([np.zeros(3), 0.1 * RNG.normal(size=9)])
 
-    def pivot(q, t, params):
-        return jnp.sum((q - jnp.stack([lagjax.samples(KNOTS, params, "cubic")(t), 0.0])) ** 2) - 1.0
-
-    scene = lagjax.System(weight, constraints=pivot)
-
     def middle(values):
         ts = jnp.linspace(0.0, KNOTS[-1], 4)
-        return lagjax.simulate(scene, jnp.array([0.0, -1.0]), jnp.zeros(2), ts, values, solver=MACHINE).q[2, 0]
+        return lagjax.simulate(DRIVEN_PIVOT, jnp.array([0.0, -1.0]), jnp.zeros(2), ts, values, solver=MACHINE).q[2, 0]
 
     u, d = np.asarray(values), np.eye(12)[4]
     difference = (middle(u + 1e-6 * d) - middle(u - 1e-6 * d)) / 2e-6

@@ -50,7 +50,7 @@ def loss(function):
 @pytest.mark.parametrize("mode", sweep(MODES, kept=["reverse"]))
 def test_first_derivatives_by_the_state_parameters_and_times(mode):
     right = jax.jit(jax.jacfwd(exact, argnums=(0, 1)))(X, TIMES)
-    np.testing.assert_allclose(MODES[mode](followed)(X), right[0], atol=1e-11)
+    np.testing.assert_allclose(jax.jit(MODES[mode](followed))(X), right[0], atol=1e-11)
     np.testing.assert_allclose(jax.jit(MODES[mode](followed, argnums=1))(X, TIMES), right[1], atol=1e-11)
 
 

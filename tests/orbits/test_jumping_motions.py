@@ -11,15 +11,17 @@ import lagjax
 G = 9.81
 
 
+RIMLESS_WHEEL = lagjax.System(lambda q, v: 0.5 * v**2 - G * jnp.cos(q))
+
+
 @pytest.mark.slow
 def test_the_rimless_wheel_walks_as_its_map_says():
     """Spokes of length one, 2α apart, on a slope γ: ω² → cos²2α ω² + 4 g sin α sin γ in a step."""
     alpha, slope = 0.3, 0.08
-    wheel = lagjax.System(lambda q, v: 0.5 * v**2 - G * jnp.cos(q))
     step = lagjax.Transition(
         "roll", "roll", lambda q, v: q - (slope + alpha), 1, lambda q, v: (q - 2 * alpha, jnp.cos(2 * alpha) * v)
     )
-    scene = lagjax.Hybrid({"roll": wheel}, [step], "roll")
+    scene = lagjax.Hybrid({"roll": RIMLESS_WHEEL}, [step], "roll")
     orbit = lagjax.periodic_orbit(scene, 0.0, 1.0, 0.6)
     fast = 4 * G * np.sin(alpha) * np.sin(slope) / np.sin(2 * alpha) ** 2  # ω² before a step
     here = np.sqrt(fast + 2 * G * (np.cos(slope + alpha) - np.cos(orbit.q0)))
@@ -31,7 +33,7 @@ def test_the_rimless_wheel_walks_as_its_map_says():
         lagjax.periodic_orbit(scene, 0.0, 1.0, 0.6, energy=1.0)
     with pytest.raises(TypeError, match="This is for one System"):
         lagjax.family(scene, orbit)
-    modes = {"a": wheel, "b": wheel}
+    modes = {"a": RIMLESS_WHEEL, "b": RIMLESS_WHEEL}
     over = [lagjax.Transition(x, y, lambda q, v: q - 0.2, 1) for x, y in ("ab", "ba")]
     with pytest.raises(lagjax.SimulationError, match="ends in another mode"):
         lagjax.periodic_orbit(lagjax.Hybrid(modes, over, "a"), 0.0, 1.0, 0.3)
@@ -164,18 +166,20 @@ def test_crossings_in_every_mode_and_where_the_mode_changes():
     np.testing.assert_allclose(found["clock"].t[:2], [2.0, np.nan], atol=1e-13)
 
 
+SLIDING_BLOCK = lagjax.System(
+    lambda q, v: 0.5 * v @ v - q[1], contacts=lambda q: {"floor": q[1]}, slip=lambda q, v: {"floor": v[0]},
+    friction=lambda params: {"floor": params},
+)  # fmt: skip
+
+
 @pytest.mark.slow
 def test_crossings_of_a_block_that_slides_and_stops():
     """On the floor, with friction μ and gravity one: x = v t − ½ μ t² to the stop at v²/2μ, where it stays."""
-    block = lagjax.System(
-        lambda q, v: 0.5 * v @ v - q[1], contacts=lambda q: {"floor": q[1]}, slip=lambda q, v: {"floor": v[0]},
-        friction=lambda params: {"floor": params},
-    )  # fmt: skip
     sections = {"near": lambda q, v: q[0] - 1.0, "stop": lambda q, v: v[0] - 1e-3, "beyond": lambda q, v: q[0] - 4.01}
 
     def found(v, mu):
         start = jnp.zeros(2), jnp.stack([v, 0.0])
-        return lagjax.crossings(block, sections, *start, jnp.array([0.0, 9.0]), mu, count=3)
+        return lagjax.crossings(SLIDING_BLOCK, sections, *start, jnp.array([0.0, 9.0]), mu, count=3)
 
     v, mu = 2.0, 0.5
     crossed = found(v, mu)

@@ -98,7 +98,7 @@ JUMPS = {
         lambda u: jnp.pi / 2 - jnp.abs(jnp.mod(u + jnp.pi / 2, 2 * jnp.pi) - jnp.pi)),
     "arccos of a cosine": (lambda u: jnp.arccos(jnp.cos(u)), lambda u: jnp.abs(WRAPPED(u))),
 }  # fmt: skip
-FAST_JUMPS = ("arctan2 of other lengths", "arctan at a pole", "copysign")
+FAST_JUMPS = ("arctan2 of other lengths", "copysign")
 REMOVABLE_POLE = lagjax.System(lambda q, v: 0.5 * v * v, forces=lambda q, v: jnp.arctan(jnp.sin(q) / q))
 
 

@@ -159,12 +159,16 @@ def test_a_matrix_falls_into_blocks():
     assert program.operations <= 36  # twelve for each
 
 
-def test_large_matrices_are_left_to_diffrax():
-    def lagrangian(q, v):
-        mass = jnp.eye(30) + 0.1 * jnp.outer(q, q)
-        return 0.5 * v @ v - 0.5 * q @ jnp.linalg.solve(mass, q)
+def large_matrix(q, v):
+    mass = jnp.eye(30) + 0.1 * jnp.outer(q, q)
+    return 0.5 * v @ v - 0.5 * q @ jnp.linalg.solve(mass, q)
 
-    facts = lagjax.System(lagrangian).explain(np.ones(30), np.zeros(30))
+
+LARGE_MATRIX = lagjax.System(large_matrix)
+
+
+def test_large_matrices_are_left_to_diffrax():
+    facts = LARGE_MATRIX.explain(np.ones(30), np.zeros(30))
     assert "a linear system of 30 rows is larger than the 8" in facts.solver and facts.path == "array"
 
 
@@ -187,9 +191,13 @@ def real_well(q, v):
     return 0.5 * v @ v - ((x * x - y * y - 1) ** 2 + 4 * x * x * y * y)
 
 
+WELL = lagjax.System(well)
+REAL_WELL = lagjax.System(real_well)
+
+
 @pytest.mark.parametrize("q, v", [((0.3, 0.4), (0.1, -0.2)), ((1.0, 0.0), (0.3, 0.0))])  # the second in its minimum
 def test_a_complex_well_is_the_real_one(q, v):
-    ts, system, real = np.linspace(0.0, 5.0, 6), lagjax.System(well), lagjax.System(real_well)
+    ts, system, real = np.linspace(0.0, 5.0, 6), WELL, REAL_WELL
     one, other = (lagjax.simulate(of, np.array(q), np.array(v), ts) for of in (system, real))
     assert in_machine_code(system, np.array(q), np.array(v))
     np.testing.assert_allclose(one.q, other.q, rtol=1e-11, atol=1e-12)
@@ -204,9 +212,12 @@ def joukowski(q, v):
     return 0.5 * jnp.abs(rate) ** 2 - 0.5 * (image.real**2 + 4 * image.imag**2)
 
 
+JOUKOWSKI = lagjax.System(joukowski)
+
+
 def test_oscillators_behind_a_conformal_map():
     ts, q, v = np.linspace(0.0, 3.0, 7), np.array([1.5, 0.7]), np.array([0.1, -0.2])
-    path = lagjax.simulate(lagjax.System(joukowski), q, v, ts, rtol=1e-12)
+    path = lagjax.simulate(JOUKOWSKI, q, v, ts, rtol=1e-12)
     z = path.q[:, 0] + 1j * path.q[:, 1]
     start = complex(q[0], q[1])
     image, rate = start + 1 / start, complex(v[0], v[1]) * (1 - start**-2)

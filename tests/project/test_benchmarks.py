@@ -295,7 +295,9 @@ RECORD = {
 }
 
 
-@pytest.mark.parametrize("part", ["errors", "mixed", "constraints", *RECORD])
+@pytest.mark.parametrize(
+    "part", sweep(["errors", "mixed", "constraints", *RECORD], kept=["errors", "sizes", "latency"])
+)
 def test_figure(tmp_path, part):
     pytest.importorskip("matplotlib", reason="figures need matplotlib")
     record = {part: {"rows": RECORD[part]} if part in RECORD else comparison_of({"lagjax": 1.0, "numba": 1.01})}
@@ -351,10 +353,12 @@ def test_reference_without_heyoka(monkeypatch):
     np.testing.assert_allclose(check, truth, rtol=1e-11)
 
 
+FRESH = lagjax.System(lambda q, v, params: 0.5 * v**2 - params["emitted"] * q**2)  # nobody has its kernel yet
+
+
 def test_a_change_of_emitted_text_is_seen(tmp_path, monkeypatch, capsys):
     emitted = of_benchmarks("emitted")
-    fresh = lagjax.System(lambda q, v, params: 0.5 * v**2 - params["emitted"] * q**2)  # nobody has its kernel yet
-    monkeypatch.setattr(emitted, "scenes", lambda: {"fresh": (fresh, 1.0, 0.0, {"emitted": 0.7})})
+    monkeypatch.setattr(emitted, "scenes", lambda: {"fresh": (FRESH, 1.0, 0.0, {"emitted": 0.7})})
     monkeypatch.setattr(emitted, "FORMS", (emitted.motion,))
     found = emitted.texts()
     for name, text in found.items():

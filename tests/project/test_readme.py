@@ -80,7 +80,12 @@ PUBLIC = {name: getattr(lagjax, name) for name in (*lagjax.__all__, *lagjax.resu
 PUBLIC |= {f"designs.{name}": getattr(lagjax.designs, name) for name in lagjax.designs.__all__}
 PUBLIC = {name: thing for name, thing in PUBLIC.items() if callable(thing)}
 METHODS = {f"{name}.{own}": of for name, it in PUBLIC.items() if inspect.isclass(it) for own, of in methods(it).items()}
-COSTLY = ("work_precision", "System.project", "Trajectory.animate", "Trajectory.to_pandas", "Trajectory.health")
+# Those that take a third of a second or more: their subjects have tests of their own.
+COSTLY = (
+    "work_precision", "System.project", "Trajectory.animate", "Trajectory.to_pandas", "Trajectory.health", "FineOutput",
+    "System", "branch_off", "conserved_quantities", "equilibrium", "linearize", "lyapunov_spectrum", "normal_modes",
+    "samples", "steady_motion", "sweep",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("name", sweep(list(PUBLIC | METHODS), kept=lambda name: name not in COSTLY))

@@ -160,22 +160,24 @@ def beside_it(q, qdot):
     return q - 0.1
 
 
+DISK = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - GRAVITY * q[1], constraints=lambda q: jnp.sum(q**2) - 1.0)
+
+
 @pytest.mark.slow
 def test_crossings_of_several_sections_under_constraints(tmp_path):
-    disk = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - GRAVITY * q[1], constraints=lambda q: jnp.sum(q**2) - 1.0)
     sections = {"bottom": lambda q, v: q[0], "height": lambda q, v, t: q[1] + 0.8 + 0.01 * t}
     angles = np.linspace(0.1, 1.5, 9)
     on_it = lambda angle: jnp.stack([jnp.sin(angle), -jnp.cos(angle)])
     q0 = lambda point: (1.0 + 1e-3 * (point["angle"] > 1.4)) * on_it(point["angle"])
     keep = lambda trajectory, crossings: {"times": {name: x.t for name, x in crossings.items()}}
     run = run_sweep(
-        disk, {"angle": angles}, np.array([0.0, 1.0]), q0=q0, qdot0=np.zeros(2), keep=keep,
+        DISK, {"angle": angles}, np.array([0.0, 1.0]), q0=q0, qdot0=np.zeros(2), keep=keep,
         crossings={"section": sections, "count": 3}, store=tmp_path / "store", progress=False,
     )  # fmt: skip
     data = run.open()
     assert run.status().results == {"successful": 8, "inconsistent_start": 1}
     assert np.isnan(data["times.bottom"][8]).all()
-    alone = lagjax.crossings(disk, sections, on_it(angles[3]), jnp.zeros(2), jnp.array([0.0, 1.0]), count=3)
+    alone = lagjax.crossings(DISK, sections, on_it(angles[3]), jnp.zeros(2), jnp.array([0.0, 1.0]), count=3)
     for name in sections:
         np.testing.assert_allclose(data[f"times.{name}"][3], alone[name].t, rtol=1e-9)
 
@@ -285,18 +287,22 @@ def test_members_do_not_depend_on_their_neighbours(tmp_path, undisturbed, unit):
     np.testing.assert_array_equal(run.open().fastest, swept(whole).open().fastest)
 
 
+def heavier(q, qdot, params):
+    return 0.5 * params**2 * qdot**2 + 2 * GRAVITY * params * jnp.cos(q)
+
+
+HEAVIER = lagjax.System(heavier)
+
+
 def test_changed_descriptions_are_refused_with_the_difference(tmp_path, undisturbed):
     swept(tmp_path)
-
-    def heavier(q, qdot, params):
-        return 0.5 * params**2 * qdot**2 + 2 * GRAVITY * params * jnp.cos(q)
 
     def by_constant(gravity):
         return lagjax.System(lambda q, qdot, params: 0.5 * params**2 * qdot**2 + gravity * params * jnp.cos(q))
 
     common = {**RULE, "store": tmp_path / "store"}
     with pytest.raises(ValueError, match=r"(?s)another description.*\+.*2 \* GRAVITY \* params"):
-        run_sweep(lagjax.System(heavier), OVER, TS, **common)
+        run_sweep(HEAVIER, OVER, TS, **common)
     with pytest.raises(ValueError, match=r"length.*angle.*in the store, now"):
         swept(tmp_path, OVER | {"angle": np.linspace(0.0, 3.0, 8)})
     with pytest.raises(ValueError, match="rtol: None in the store, now 1e-06"):
@@ -328,11 +334,14 @@ def outwards(q, qdot, params):  # q¨ = 1 where nothing pulls; a collision where
     return 0.5 * qdot**2 + q + params["pull"] / q - 0.5 * params["k"] * q**2
 
 
+OUTWARDS = lagjax.System(outwards)
+
+
 def test_failures_cost_the_others_nothing(tmp_path):
     start, pull, k = 1.0 + np.arange(300) / 300, np.zeros(300), np.zeros(300)
     start[5], pull[[20, 150]], k[77] = -1.0, 9.0, 1e12
     over = {("start", "pull", "k"): (start, pull, k)}
-    system, of = lagjax.System(outwards), lambda point: {"pull": point["pull"], "k": point["k"]}
+    system, of = OUTWARDS, lambda point: {"pull": point["pull"], "k": point["k"]}
     q0 = lambda point: jnp.where(point["start"] < 0, jnp.nan, point["start"])
     rule = {**RULE, "store": tmp_path / "store", "q0": q0, "params": of, "unit": 70, "max_steps": 300}
     told = run_sweep(system, over, TS, **rule).status()
@@ -852,6 +861,9 @@ def test_example(tmp_path, monkeypatch):
     assert 0 < np.isfinite(flip).sum() < flip.size
 
 
+PENDULUM_ALONE = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
+
+
 def test_the_first_look_finds_a_type_for_all_members(tmp_path):
     """1 of one member and 1.5 of another are floats: `keep` in plain Python, called member by member."""
 
@@ -859,7 +871,7 @@ def test_the_first_look_finds_a_type_for_all_members(tmp_path):
         fastest = float(np.abs(trajectory.qdot).max())
         return {"speed": 1 if fastest < 0.5 else 1.5, "count": len(trajectory.ts)}
 
-    pendulum = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
+    pendulum = PENDULUM_ALONE
     angles = np.array([0.1, 0.2, 1.0, 2.0])
     swept = run_sweep(
         pendulum, {"angle": angles}, jnp.linspace(0.0, 5.0, 6), q0=lambda p: p["angle"], qdot0=0.0, keep=keep,

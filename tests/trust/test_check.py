@@ -150,12 +150,16 @@ def test_broken_derivatives(name):
     assert where is None or any(where in finding.where for finding in chosen)
 
 
+AT_REST = lagjax.System(at_rest)
+JITTED_AT_REST = lagjax.System(jax.jit(at_rest))
+
+
 def test_the_line_is_named():
     line = at_rest.__code__.co_firstlineno + 1
-    message = only(lagjax.check(lagjax.System(at_rest), np.ones(2), np.zeros(2))).message
+    message = only(lagjax.check(AT_REST, np.ones(2), np.zeros(2))).message
     assert f"test_check.py:{line}" in message and "at_rest" in message
     # Also from inside a function that is compiled on its own.
-    message = only(lagjax.check(lagjax.System(jax.jit(at_rest)), np.ones(2), np.zeros(2))).message
+    message = only(lagjax.check(JITTED_AT_REST, np.ones(2), np.zeros(2))).message
     assert f"test_check.py:{line}" in message
 
 
@@ -231,9 +235,12 @@ def test_singular_mass_matrices(name):
     assert findings.ok == (kind == "near_coordinate_singularity")
 
 
+TWO_MISSING = lagjax.System(lambda q, v: 0.5 * (v["a"] - v["b"]) ** 2 + v["c"] * q["d"])
+
+
 def test_several_missing_velocities_are_told_apart():
     findings = lagjax.check(
-        lagjax.System(lambda q, v: 0.5 * (v["a"] - v["b"]) ** 2 + v["c"] * q["d"]),
+        TWO_MISSING,
         {"a": 0.1, "b": 0.2, "c": 0.3, "d": 0.4},
         {"a": 1.0, "b": 2.0, "c": 3.0, "d": 4.0},
     )
@@ -245,9 +252,12 @@ def test_several_missing_velocities_are_told_apart():
     assert "+1 dq['a'] +1 dq['b']" in str(findings)
 
 
+NEGATIVE = lagjax.System(lambda q, v: -0.5 * v**2 + 0.5 * q**2)
+
+
 def test_signs_and_condition_of_the_mass_matrix():
     assert kinds(lambda q, v: v[0] * v[1] - q[0] * q[1], np.ones(2), np.ones(2)) == {"indefinite_mass_matrix"}
-    wrong = lagjax.check(lagjax.System(lambda q, v: -0.5 * v**2 + 0.5 * q**2), 1.0, 0.0)
+    wrong = lagjax.check(NEGATIVE, 1.0, 0.0)
     assert only(wrong).kind == "indefinite_mass_matrix" and "negative definite" in only(wrong).message and wrong.ok
     # Masses far apart are scaled away, coupled ones are not.
     assert kinds(lambda q, v: 1e9 * v[0] ** 2 + 1e-9 * v[1] ** 2 - q[0] ** 2, np.ones(2), np.ones(2)) == set()
@@ -258,10 +268,13 @@ def test_signs_and_condition_of_the_mass_matrix():
 # ---- forces, time scales, borders ------------------------------------------------------------------------------------
 
 
+GAINING = lagjax.System(free, dissipation=lambda q, v: 0.1 * v)
+
+
 def test_dissipation_of_the_wrong_sign():
     assert kinds(free, 0.3, 0.0, dissipation=lambda q, v: -0.1 * v**2) == {"creates_energy"}
     assert kinds(free, 0.3, 0.0, dissipation=lambda q, v: 0.1 * v**2) == set()
-    both = lagjax.check(lagjax.System(free, dissipation=lambda q, v: 0.1 * v), 0.3, 0.0)
+    both = lagjax.check(GAINING, 0.3, 0.0)
     assert "takes it out at others" in only(both).message
 
 
@@ -278,6 +291,9 @@ def test_time_scales():
     assert kinds(pair, np.ones(2), np.zeros(2)) == set()
 
 
+DRY = lagjax.System(free, dissipation=lambda q, v: 0.1 * jnp.abs(v))
+
+
 @pytest.mark.parametrize("potential, words", [(jnp.abs, "abs at"), (lambda q: jnp.maximum(q, 2 * q), "max at")])
 def test_a_kink_of_the_potential_is_no_error(potential, words):
     """The motion across it is right (`test_borders`); what is computed at this very state is that of one side."""
@@ -285,17 +301,21 @@ def test_a_kink_of_the_potential_is_no_error(potential, words):
     finding = only(lagjax.check(system, 0.0, 1.0))
     assert finding.kind == "kink" and finding.level == "advice" and finding.where == ("q",)
     assert words in finding.message and "A motion across it is right" in finding.message
-    only(lagjax.check(lagjax.System(free, dissipation=lambda q, v: 0.1 * jnp.abs(v)), 0.0, 0.0))
+    only(lagjax.check(DRY, 0.0, 0.0))
+
+
+def friction_at_a_speed(q, v):
+    return -0.3 * jnp.sign(v)
+
+
+RUBBED = lagjax.System(free, forces=friction_at_a_speed)
 
 
 def test_discontinuities_are_found_where_they_are():
-    def friction(q, v):
-        return -0.3 * jnp.sign(v)
-
-    here = only(lagjax.check(lagjax.System(free, forces=friction), 0.3, 0.0))
+    here = only(lagjax.check(RUBBED, 0.3, 0.0))
     assert here.kind == "discontinuity" and here.level == "advice" and "sign" in here.message
     assert "at this state" in here.message
-    near = only(lagjax.check(lagjax.System(free, forces=friction), 0.3, 0.4))
+    near = only(lagjax.check(RUBBED, 0.3, 0.4))
     assert near.level == "advice" and near.where == ("dq",)
     finding = only(lagjax.check(STEP, 1.0, 0.5))
     assert finding.level == "advice" and "0.25 away along q" in finding.message and "where" not in finding.where
@@ -381,12 +401,16 @@ def test_constraints_on_velocities():
 # ---- what is given, and what comes back ------------------------------------------------------------------------------
 
 
+MASS_BY_NAME = lagjax.System(lambda q, v, params: params["m"] * v**2)
+MASS_BY_NUMBER = lagjax.System(lambda q, v, params: params * v**2)
+
+
 def test_numbers_that_are_given():
     params = {"m": jnp.nan, "list": [1.0, -jnp.inf]}
-    findings = lagjax.check(lagjax.System(lambda q, v, params: params["m"] * v**2), jnp.inf, 0.0, params=params)
+    findings = lagjax.check(MASS_BY_NAME, jnp.inf, 0.0, params=params)
     assert findings.kinds == {"not_finite"}
     assert {finding.where[0] for finding in findings} == {"q", "params['m']", "params['list'][1]"}
-    whole = lagjax.check(lagjax.System(lambda q, v, params: params * v**2), 1.0, 0.0, params=2)
+    whole = lagjax.check(MASS_BY_NUMBER, 1.0, 0.0, params=2)
     assert only(whole).kind == "integer_parameter"
     assert not lagjax.check(FREE, 1e-9, 0.0).found  # the default atol is as small
     small = only(lagjax.check(TWO_COORDINATES, {"x": 1e-9, "angle": 1.0}, {"x": 0.0, "angle": 0.0}))
@@ -397,11 +421,17 @@ def test_numbers_that_are_given():
     assert kinds(free, np.float32(1.0), np.float32(0.0)) == {"single_precision"}
 
 
+FREE_MASS = lagjax.System(lambda q, v: 0.5 * v**2)
+
+
 def test_without_x64(monkeypatch):
     with jax.enable_x64(False):
-        finding = only(lagjax.check(lagjax.System(lambda q, v: 0.5 * v**2), np.float64(1.0), np.float64(0.0)))
+        finding = only(lagjax.check(FREE_MASS, np.float64(1.0), np.float64(0.0)))
     assert finding.kind == "single_precision"
     assert "float64 was given" in finding.message and "jax_enable_x64" in finding.message
+
+
+SCALAR_FORCE = lagjax.System(free, forces=lambda q, v: 1.0)
 
 
 def test_refused():
@@ -413,7 +443,7 @@ def test_refused():
     with pytest.raises(ValueError, match="outside of jit"):
         jax.jit(lambda q: lagjax.check(scene, q, 0.0).ok)(1.0)
     with pytest.raises(TypeError, match="forces must return the structure of q"):
-        lagjax.check(lagjax.System(free, forces=lambda q, v: 1.0), np.ones(2), np.ones(2))
+        lagjax.check(SCALAR_FORCE, np.ones(2), np.ones(2))
 
 
 def test_findings_are_frozen_sorted_and_fit_a_screen():

@@ -269,13 +269,17 @@ def test_a_nearly_singular_mass_matrix_and_scaling():
     assert "mass_matrix" in flagged(health(1.0, 1 - 1e-9))
 
 
+def force_of_trap(q, v):
+    return -jnp.where(q > 0, jnp.sqrt(q) ** 9, 0.0)
+
+
+TRAP = lagjax.System(lagrangians.free_particle, forces=force_of_trap)
+
+
 def test_gradients_that_are_not_finite():
     # Where q < 0 the force is zero, but the derivative of the branch that is not taken is NaN.
-    def force(q, v):
-        return -jnp.where(q > 0, jnp.sqrt(q) ** 9, 0.0)
 
-    trap = lagjax.System(lagrangians.free_particle, forces=force)
-    trajectory = lagjax.simulate(trap, 1.0, -1.0, TS[:9], solver=diffrax.Tsit5(), rtol=1e-6)
+    trajectory = lagjax.simulate(TRAP, 1.0, -1.0, TS[:9], solver=diffrax.Tsit5(), rtol=1e-6)
     health = trajectory.health()
     assert trajectory.ok and flagged(health) == {"gradients"}
     assert health.gradients_time == TS[int(np.argmax(trajectory.q <= 0))]

@@ -60,19 +60,24 @@ def test_a_large_scene_explains_itself_in_groups():
     assert "q[0] … q[999]" in str(facts) and len(str(facts)) < 1000
 
 
+def kinetic_of_links(q, qdot):
+    return 0.5 * jnp.sum((1 + q[:, 1:] ** 2) * qdot**2) - jnp.sum(q[:, 1])
+
+
+def links(q):
+    return jnp.sum(jnp.diff(q, axis=0) ** 2, axis=1) - 2.0
+
+
+LINKED = lagjax.System(kinetic_of_links, constraints=links, path="array")
+
+
 def test_products_are_those_of_the_matrices():
     """A chain of links between two points: constraints, and a mass matrix that varies, against their arrays."""
     count = 60
     q = np.stack([np.arange(1.0, count + 1), np.random.default_rng(2).normal(size=count)], axis=1)
     v = np.random.default_rng(3).normal(size=q.shape)
 
-    def kinetic(q, qdot):
-        return 0.5 * jnp.sum((1 + q[:, 1:] ** 2) * qdot**2) - jnp.sum(q[:, 1])
-
-    def links(q):
-        return jnp.sum(jnp.diff(q, axis=0) ** 2, axis=1) - 2.0
-
-    system, layout = lagjax.System(kinetic, constraints=links, path="array"), Layout.from_state(q, v)
+    system, layout = LINKED, Layout.from_state(q, v)
     derivation = derivation_of(system, layout, None)
     assert derivation.form.is_sparse
     state = q.ravel(), v.ravel(), np.zeros(()), None
@@ -156,14 +161,17 @@ def test_the_spectrum_of_a_sparse_mass_matrix(kind):
     assert np.abs(mass @ direction).max() < 0.1 * np.abs(direction).max()
 
 
-def test_a_scene_too_large_for_the_machine_says_so():
-    def attraction(q, qdot):
-        apart = jnp.sum((q[:, None] - q) ** 2, axis=-1)
-        return 0.5 * jnp.sum(qdot**2) + jnp.sum(1 / jnp.sqrt(apart + 1.0))
+def attraction(q, qdot):
+    apart = jnp.sum((q[:, None] - q) ** 2, axis=-1)
+    return 0.5 * jnp.sum(qdot**2) + jnp.sum(1 / jnp.sqrt(apart + 1.0))
 
+
+BODIES = lagjax.System(attraction)
+
+
+def test_a_scene_too_large_for_the_machine_says_so():
     many, still = np.zeros((10**6, 3)), np.zeros((10**6, 3))
-    bodies = lagjax.System(attraction)
-    for ask in (lambda: lagjax.simulate(bodies, many, still, TS), lambda: bodies.acceleration(many, still)):
+    for ask in (lambda: lagjax.simulate(BODIES, many, still, TS), lambda: BODIES.acceleration(many, still)):
         with pytest.raises(ValueError, match=r"gradient of this L, of 3000000 coordinates, would take some .* GiB"):
             ask()
     free = FREE_POINTS

@@ -1,5 +1,7 @@
 """A motion that stops is named by what it ran into, and by both engines alike, member by member."""
 
+import re
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -124,6 +126,31 @@ def test_the_message_tells_what_it_ran_into(name):
         lagjax.simulate(lagjax.System(lagrangian, forces=forces), q0, qdot0, TS, **more)
 
 
+POLES = (
+    lagjax.System(lambda q, v: 0.5 * v**2 + 1 / q**3),
+    lagjax.System(lambda q, v: 0.5 * v**2 + 1 / q**3),
+)
+KINKS = (
+    lagjax.System(lambda q, v: 0.5 * v**2 - jnp.abs(q - 3.0)),
+    lagjax.System(lambda q, v: 0.5 * v**2 - jnp.abs(q - 3.0)),
+)
+
+
+def test_scenes_of_one_text_are_told_their_own_lines():
+    """They are derived once; the line is that of the functions of each."""
+    lines = []
+    for scene, kink in zip(POLES, KINKS, strict=True):
+        with pytest.raises(lagjax.SimulationError) as stopped:
+            lagjax.simulate(scene, 1.0, 0.0, TS)
+        with pytest.raises(ValueError, match="is on a border") as rough:
+            lagjax.linearize(kink, 3.0)
+        said = str(stopped.value), str(rough.value), *map(str, lagjax.check(kink, 3.0, 0.0))
+        lines.append([re.findall(r"test_stopped.py:(\d+)", text) for text in said])
+        assert all(lines[-1])
+    first, second = np.array(lines[0], int), np.array(lines[1], int)
+    np.testing.assert_array_equal(second - first, 1)
+
+
 def test_the_health_of_a_batch_tells_it_of_the_first_that_failed():
     batch = lagjax.simulate_batch(SCENE, Q0, 0 * Q0, TS, PARAMS, batch_axes=(0, 0, 0), **BUDGET)
     assert "from t = 0.5 on, whatever the state. It comes from where(True, nan, 0)" in batch.health().diagnosis
@@ -139,23 +166,29 @@ def test_a_solver_that_goes_across_a_kink_names_its_line():
         lagjax.simulate(scene, 1.0, 0.0, TS, solver=diffrax.Tsit5(), max_steps=60)
 
 
+def long_function(q, qdot):
+    x = q
+    for k in range(5000):
+        x = jnp.sin(x + 1e-3 * k)
+    return 0.5 * qdot @ qdot + 1e-3 * jnp.sum(x)
+
+
+LONG_FUNCTION = lagjax.System(kinetic, forces=lambda q, v, t: fades(q, v, t) + 0 * long_function(q, v))
+
+
 @pytest.mark.slow
 def test_a_large_scene_that_fails_is_looked_at_in_no_more_time_than_it_ran():
     """The operations that are gone through are bounded: a look at this one, line by line, would take minutes."""
-
-    def lagrangian(q, qdot):
-        x = q
-        for k in range(5000):
-            x = jnp.sin(x + 1e-3 * k)
-        return 0.5 * qdot @ qdot + 1e-3 * jnp.sum(x)
-
-    scene = lagjax.System(kinetic, forces=lambda q, v, t: fades(q, v, t) + 0 * lagrangian(q, v))
+    scene = LONG_FUNCTION
     with pytest.raises(lagjax.SimulationError, match=r"the force on q(.|\n)*from t = 0.5 on, whatever the state.$"):
         lagjax.simulate(scene, np.ones(2), np.zeros(2), TS)
 
 
+OFTEN_SWITCHED = lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v, t: switched(q, v, t))
+
+
 def test_jumps_that_spend_the_budget_are_called_jumps_and_not_stiff():
-    kink = lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v, t: switched(q, v, t))
+    kink = OFTEN_SWITCHED
     with pytest.raises(lagjax.SimulationError, match="has a jump or a corner there") as error:
         lagjax.simulate(kink, 0.0, 0.0, TS, **BUDGET)
     assert "stiff" not in str(error.value)
@@ -207,9 +240,12 @@ def fourier(q, v, t):  # no scalar program, and it takes arrays of JAX only
     return jnp.abs(jnp.fft.fft(q.at[0].add(0.0))) * jnp.sqrt(1 - t)
 
 
+FOURIER = lagjax.System(lambda q, v: 0.5 * v @ v, forces=fourier)
+
+
 @pytest.mark.slow
 def test_a_scene_without_programs_that_fails_keeps_its_error():
-    scene = lagjax.System(lambda q, v: 0.5 * v @ v, forces=fourier)
+    scene = FOURIER
     with pytest.raises(lagjax.SimulationError, match="could not be followed beyond t = 1"):
         lagjax.simulate(scene, np.ones(2), np.zeros(2), np.linspace(0.0, 5.0, 6))
 
@@ -237,14 +273,19 @@ def test_a_reset_that_is_not_finite_is_named():
         lagjax.simulate(lagjax.Hybrid({"fly": ball}, [bounce], "fly"), 1.0, 0.0, TS)
 
 
-def test_a_motion_that_stops_in_contact_names_what_touches():
-    def forces(q, v, t):
-        return jnp.array([switched(q, v, t), 0.0])
+def switched_push(q, v, t):
+    return jnp.array([switched(q, v, t), 0.0])
 
-    block = lagjax.System(
-        lambda q, v: 0.5 * v @ v - 9.81 * q[1], forces=forces,
-        contacts=lambda q: {"floor": q[1] - 0.1, "wall": q[0] + 3.0},
-    )  # fmt: skip
+
+SWITCHED_BLOCK = lagjax.System(
+    lambda q, v: 0.5 * v @ v - 9.81 * q[1],
+    forces=switched_push,
+    contacts=lambda q: {"floor": q[1] - 0.1, "wall": q[0] + 3.0},
+)
+
+
+def test_a_motion_that_stops_in_contact_names_what_touches():
+    block = SWITCHED_BLOCK  # fmt: skip
     with pytest.raises(lagjax.SimulationError, match=r"In touch there: contacts\['floor'\], whose gaps"):
         lagjax.simulate(block, jnp.array([0.0, 0.1]), jnp.array([1.0, 0.0]), TS, **BUDGET)
 

@@ -2,12 +2,15 @@
 
 At 1 kHz residuals hold what the scene lacks, and neighbours agree: n samples are worth n/τ independent ones, with τ the
 sum of the correlations over all lags. Source: Geyer, *Practical Markov chain Monte Carlo*, Stat. Sci. 7 (1992) 473, for
-where correlations end; Newey & West, Econometrica 55 (1987) 703, for tapers whose spectrum has no negative parts.
+where correlations end; Newey & West, Econometrica 55 (1987) 703, for tapers whose spectrum has no negative parts; Berk,
+Ann. Stat. 2 (1974) 489, and den Haan & Levin, Handbook of Statistics 15 (1997) 299, for autoregressions instead. A
+taper shortens correlations that fall slowly, an autoregression does not. The longer of both counts.
 """
 
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solve_toeplitz
 
 from lagjax._fit.model._noise import NoiseScale, scores
 from lagjax._fit.model._residuals import Residuals, Trial
@@ -27,7 +30,8 @@ def autocorrelations(residuals: Residuals, point: Trial, noise: NoiseScale) -> l
 
 
 def _autocorrelation(residuals: Residuals, point: Trial, noise: NoiseScale, signal: int) -> Correlation:
-    """The correlation of one signal's residuals, cut at two standard errors and tapered by Parzen's window."""
+    """The correlation of one signal's residuals: cut at two standard errors and tapered by Parzen's window, or that of
+    an autoregression, if its sum is larger."""
     dof = noise.dof[signal]
     sums, count = np.zeros(1), 0
     for batch, r in zip(residuals.batches, point.residuals, strict=True):
@@ -47,7 +51,31 @@ def _autocorrelation(residuals: Residuals, point: Trial, noise: NoiseScale, sign
         return Correlation(np.ones(1), 1.0, count, float(law[1]) if len(law) > 1 else 0.0)
     x = np.arange(min(3 * cut, len(law))) / (3 * cut)
     lags = law[: 3 * cut] * np.where(x < 0.5, 1 - 6 * x**2 + 6 * x**3, 2 * (1 - x) ** 3)
+    noise_like = autoregressive_lags(law, count)
+    if np.abs(noise_like[len(law) // _FORGETS :]).max(initial=0.0) < 2.0 / np.sqrt(count):
+        lags = max(lags, noise_like, key=np.sum)
     return Correlation(lags, float(max(1.0, lags[0] + 2 * lags[1:].sum())), count, float(law[1]))
+
+
+_MOST_ORDER = 20  # of autoregressions
+_FORGETS = 10  # part of a record after which noise is forgotten: residuals that remember longer hold motion, not noise
+
+
+def autoregressive_lags(law: np.ndarray, count: int) -> np.ndarray:
+    """The correlations at the lags of `law`, from 1 on, of the autoregression that has the first of them, of the order
+    that Schwarz's criterion takes for `count` samples."""
+    best, chosen = np.inf, np.zeros(0)
+    for order in range(1, min(_MOST_ORDER, len(law) // 4) + 1):
+        weights = solve_toeplitz(law[:order], law[1 : order + 1])
+        left = 1.0 - weights @ law[1 : order + 1]  # of the variance, once the past is known
+        if not left > np.finfo(float).eps:
+            break
+        if (criterion := count * np.log(left) + order * np.log(count)) < best:
+            best, chosen = criterion, weights
+    lags = law.copy()
+    for k in range(len(chosen) + 1, len(lags)):
+        lags[k] = chosen @ lags[k - len(chosen) : k][::-1]
+    return lags if len(chosen) else np.ones(1)
 
 
 def lag_products(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:

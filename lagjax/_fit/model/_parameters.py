@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._fit.model._law_parameters import plain_dicts
 from lagjax._fit.model._transforms import AbstractTransform, Unbounded
 from lagjax._interface import as_arrays, labelled_leaves, require_finite
 
@@ -121,7 +122,7 @@ class Parameters:
         return replace(self, places=self.places[rows], owners=self.owners[rows])
 
     @functools.cached_property
-    def _cuts(self) -> list[tuple[slice, slice, Part]]:
+    def cuts(self) -> list[tuple[slice, slice, Part]]:
         cuts, begin, u_begin = [], 0, 0
         for part in self.parts:
             size = len(part.owners)
@@ -150,7 +151,7 @@ class Parameters:
 
     def __len__(self) -> int:
         """F, the number of unknowns."""
-        return self._cuts[-1][0].stop if self.parts else 0
+        return self.cuts[-1][0].stop if self.parts else 0
 
     def inverse(self, values: np.ndarray) -> np.ndarray:
         """The unknowns u (F,) at which the free ones among all `values` stand."""
@@ -167,12 +168,12 @@ class Parameters:
     def values(self, u, xp: Any = np):
         """The free numbers (X,) at u (F,); infinite where a step of the search led too far, which is a lost trial."""
         with np.errstate(over="ignore", invalid="ignore"):
-            return xp.concatenate([u[:0], *[part.transform.value(u[own], xp) for own, _, part in self._cuts]])
+            return xp.concatenate([u[:0], *[part.transform.value(u[own], xp) for own, _, part in self.cuts]])
 
     def _slopes(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The derivatives of the free numbers by u that are not zero by construction: rows, columns, and values."""
         rows, columns, values = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0)]
-        for own, free, part in self._cuts:
+        for own, free, part in self.cuts:
             with np.errstate(over="ignore", invalid="ignore"):
                 i, j, slopes = part.transform.slopes(u[own])
             rows.append(free.start + i)
@@ -209,7 +210,7 @@ class Parameters:
     def ends(self, u: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The ends (X,) of intervals of the free numbers at u (F,), of half widths `spread` (X,), inside their sets."""
         x, low, high = self.values(u), np.empty(len(spread)), np.empty(len(spread))
-        for _, rows, part in self._cuts:
+        for _, rows, part in self.cuts:
             low[rows], high[rows] = part.transform.ends(x[rows], spread[rows])
         return low, high
 
@@ -225,35 +226,35 @@ class Parameters:
 
     def log_volume(self, u, xp: Any = np):
         """log of the volume of the free numbers per volume of u, up to a constant."""
-        return sum(part.transform.log_volume(u[own], xp) for own, _, part in self._cuts)
+        return sum(part.transform.log_volume(u[own], xp) for own, _, part in self.cuts)
 
     def draw(self, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Another place (F,) to begin a search from; the numbers of one record, like its start, follow the others."""
-        drawn = np.concatenate([u[:0], *(part.transform.draw(u[own], rng) for own, _, part in self._cuts)])
+        drawn = np.concatenate([u[:0], *(part.transform.draw(u[own], rng) for own, _, part in self.cuts)])
         return np.where(self._owner_of < 0, drawn, u)
 
     @property
     def labels(self) -> tuple[str, ...]:
         """The names of the unknowns (F,): as their numbers, or as the whole leaf that they move together."""
         found = []
-        for own, rows, part in self._cuts:
+        for own, rows, part in self.cuts:
             found += self.names[rows] if part.transform.separable else [part.label] * (own.stop - own.start)
         return tuple(found)
 
     def limits(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(low, high) between which one step of the search from u (F,) may lie."""
-        pairs = [part.transform.limits(u[own]) for own, _, part in self._cuts]
+        pairs = [part.transform.limits(u[own]) for own, _, part in self.cuts]
         low, high = (np.concatenate([np.zeros(0), *ends]) for ends in zip(*pairs, strict=True)) if pairs else (u, u)
         return low, high
 
     def take_step(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:
         """The end of a step (F,) from u (F,): along the tangent of x(u), where every number moves by itself."""
-        parts = [part.transform.take_step(u[own], step[own]) for own, _, part in self._cuts]
+        parts = [part.transform.take_step(u[own], step[own]) for own, _, part in self.cuts]
         return np.concatenate([np.zeros(0), *parts])
 
     @property
     def maps(self) -> tuple[AbstractTransform, ...]:
-        return tuple(part.transform for own, _, part in self._cuts for _ in range(own.stop - own.start))
+        return tuple(part.transform for own, _, part in self.cuts for _ in range(own.stop - own.start))
 
     @property
     def reach(self) -> np.ndarray:
@@ -290,7 +291,7 @@ class Parameters:
         """The place of the unknown that moves the free number of this name (`row`) alone. Raises `ValueError`."""
         row = self.row(name)
         name = self.names[row]
-        own, rows, part = next(cut for cut in self._cuts if cut[1].start <= row < cut[1].stop)
+        own, rows, part = next(cut for cut in self.cuts if cut[1].start <= row < cut[1].stop)
         if not part.transform.separable:
             raise ValueError(
                 f"{name} moves only together with the other numbers of {part.label}, whose transform is "
@@ -302,13 +303,20 @@ class Parameters:
         """The parameters at u (F,), where the unknowns `kept` (F,) stay: each of them moves a number of its own, or
         stays with all others of its leaf."""
         parts, names = [], []
-        for own, rows, part in self._cuts:
+        for own, rows, part in self.cuts:
             stays = kept[own] if part.transform.separable else np.full(len(part.places), kept[own].all())
             if not stays.all():
                 owners = part.owners[~stays] if part.transform.separable else part.owners
                 parts.append(part._replace(places=part.places[~stays], owners=owners))
             names += [name for name, kept_too in zip(self.names[rows], stays, strict=True) if not kept_too]
         return replace(self, first=self.numbers(u), parts=tuple(parts), names=tuple(names))
+
+    def zero(self, u: np.ndarray, stays: np.ndarray) -> "Parameters":
+        """The parameters at u (F,), where the numbers that the unknowns `stays` (F,) move are zero and stay."""
+        fewer = self.fix(u, stays)
+        first = fewer.first.copy()
+        first[np.setdiff1d(self.free_places, fewer.free_places)] = 0.0
+        return replace(fewer, first=first)
 
     def extend(self, u: np.ndarray, rows: slice) -> tuple["Parameters", np.ndarray]:
         """The parameters of one more record with numbers of its own, and u (F,) where these are in the middle of those
@@ -321,7 +329,7 @@ class Parameters:
     def elements(self) -> tuple[str, ...]:
         """The names of the free numbers (X,) without the record: `params['bias']`, or `params['bias'][:, 0]`."""
         found = list(self.names)
-        for _, rows, part in self._cuts:
+        for _, rows, part in self.cuts:
             for k in range(rows.start, rows.stop) if part.owners.max() >= 0 else ():
                 found[k] = re.sub(r"\[\d+(?:, )?([\d, ]*)\]$", lambda m: f"[:, {m[1]}]" if m[1] else "", found[k])
         return tuple(found)
@@ -419,10 +427,10 @@ class Unknowns(NamedTuple):
 
 
 def _broadcast_prefix(prefix: PyTree, tree, leaves: list, name: str) -> list:
-    whole = jax.tree.unflatten(tree, leaves)
+    whole = plain_dicts(jax.tree.unflatten(tree, leaves))
     try:
-        spread = jax.tree.broadcast(prefix, whole, is_leaf=lambda leaf: leaf is None)
-        return tree.flatten_up_to(spread)
+        spread = jax.tree.broadcast(plain_dicts(prefix), whole, is_leaf=lambda leaf: leaf is None)
+        return jax.tree.structure(whole).flatten_up_to(spread)
     except ValueError:
         raise ValueError(
             f"{name} must be one value for all parameters, or name every one of them as params0 does; got {prefix!r}. "

@@ -108,7 +108,9 @@ class Signals:
         function = accept(of_state, "observe", extras=("t", "params", "inputs"))
         if form is None and "inputs" in function.extras:
             raise ValueError("observe asks for `inputs`, which records[0] has none of: give Record(..., inputs=...).")
-        self.names = tuple("values" + name for name in record.names)
+        said = getattr(of_state, "__name__", "<lambda>")  # a dict has names of its own
+        whole = "values" if said == "<lambda>" or isinstance(record.values, dict) else said
+        self.names = tuple(whole + name for name in record.names)
 
         def observe_state(y, t, numbers, inputs):
             q, qdot = map(layout.restore, halves(y))

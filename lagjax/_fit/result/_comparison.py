@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lagjax._fit.model._noise import KnownNoise, NoiseScale
-from lagjax._fit.model._residuals import LostMotion, Point, Residuals
+from lagjax._fit.model._noise import AbstractNoise, KnownNoise, NoiseScale
+from lagjax._fit.model._residuals import LostMotion, Point, Residuals, Trial
 from lagjax._fit.search._descent import minimise
 
 _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT = 1e-2, 40  # a record left out is then known to a hundredth of its noise
@@ -28,7 +28,7 @@ class Comparison(NamedTuple):
     - `free`: how many free numbers are seen; `log_likelihood`, `aic`, `bic`: of as many samples as are effective.
     - `left_out`: the root mean square residuals of records that were left out, by signal; None without folds.
     - `best`: without folds the fit of the smallest BIC. With folds the fit of the fewest free numbers among those that
-      follow records left out as well as any does, within the standard error of the difference over the groups.
+      follow records left out as well as any does, within the standard error of the difference over the records.
     """
 
     names: tuple[str, ...]
@@ -61,15 +61,19 @@ def comparison(fits: dict[str, Any], folds: int) -> Comparison:
     margin = np.partition(np.array(bic), 1)[1] - min(bic)
     said = [f"The data prefer {_fit_label(names[best])} fit, by {margin:.1f} in BIC ({count:.0f} effective samples)."]
     if folds:
-        left, scores = zip(*(_cross_validate(fit, folds) for fit in fits.values()), strict=True)
-        simplest = _fit_label(names[best := _choose_simplest(free, np.array(scores))])
+        every = (fit.residual_function for fit in fits.values())
+        pairs = zip(every, fits.values(), strict=True)
+        left, scores = zip(
+            *(cross_validate(r, Point(f.u, f.states), f.noise_scale, f.law, folds) for r, f in pairs), strict=True
+        )
+        simplest = _fit_label(names[best := choose_simplest(free, np.array(scores))])
         said.append(f"Left out in {folds} groups, no record is followed better than by {simplest} fit, but for chance.")
     rows = [*_table(names, free, logs, aic, bic, left), *said]
     return Comparison(names, free, logs, aic, bic, left, names[best], "\n".join(rows))
 
 
-def _choose_simplest(free: tuple[int, ...], scores: np.ndarray) -> int:
-    """The fit with the fewest free numbers whose scores (fits, groups) are within one standard error of the best.
+def choose_simplest(free: tuple[int, ...], scores: np.ndarray) -> int:
+    """The fit with the fewest free numbers whose scores (fits, records) are within one standard error of the best.
     Source: Hastie, Tibshirani & Friedman, *The Elements of Statistical Learning* (2009), §7.10."""
     means = scores.mean(axis=1)
     if not np.isfinite(means).any():
@@ -95,32 +99,47 @@ def _table(names, free, logs, aic, bic, left) -> list[str]:
     return rows
 
 
-def _cross_validate(fit, folds: int) -> tuple[dict[str, float], np.ndarray]:
-    """RMS residuals by signal of records left out, and for each group their mean logarithm; both infinite where a
-    record cannot be followed. A signal that only these have is as noisy as in the fit of all."""
-    residuals, scores = fit.residual_function, np.zeros(folds)
-    groups = np.array([piece.record for piece in residuals.pieces]) % folds
+def cross_validate(
+    residuals: Residuals, fitted: Point, noise: NoiseScale, law: AbstractNoise, folds: int
+) -> tuple[dict[str, float], np.ndarray]:
+    """RMS residuals by signal of records left out, and for each record their mean logarithm; all infinite where one
+    cannot be followed. A signal that only these have is as noisy as in the fit of all."""
+    owners, scores = np.array([piece.record for piece in residuals.pieces]), np.zeros(len(residuals.records))
     squares, weights = dict.fromkeys(residuals.names, 0.0), dict.fromkeys(residuals.names, 0.0)
+    groups = owners % folds
     for group in range(folds):
         rest, apart = (_select_pieces(residuals, keep) for keep in (groups != group, groups == group))
-        begin, left_out = Point(fit.u, fit.states[groups != group]), Point(np.zeros(0), fit.states[groups == group])
-        known = dict(zip(residuals.names, zip(*fit.noise_scale, strict=True), strict=True))
+        begin, left_out = Point(fitted.u, fitted.starts[groups != group]), fitted.starts[groups == group]
+        known = dict(zip(residuals.names, zip(*noise, strict=True), strict=True))
         try:
-            done = minimise(rest, begin, fit.law, _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
+            done = minimise(rest, begin, law, _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
             known |= zip(rest.names, zip(*done.noise, strict=True), strict=True)
-            law = KnownNoise(NoiseScale(*np.array([known[name] for name in apart.names]).T))
-            kept = np.isin(np.arange(len(fit.u)), residuals.unknowns.shared)
+            sensed = KnownNoise(NoiseScale(*np.array([known[name] for name in apart.names]).T))
+            kept = np.isin(np.arange(len(fitted.u)), residuals.unknowns.shared)
             apart = apart.with_parameters(residuals.parameters.fix(done.trial.u, kept))
-            end = minimise(apart, left_out._replace(u=done.trial.u[~kept]), law, _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
+            point = Point(done.trial.u[~kept], left_out)
+            end = minimise(apart, point, sensed, _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
         except LostMotion:
-            return dict.fromkeys(residuals.names, np.inf), np.full(folds, np.inf)
-        square, weight = (apart.weights * end.trial.flat() ** 2).sum(axis=0), apart.weights.sum(axis=0)
-        shown = weight > 0
-        scores[group] = 0.5 * np.mean(np.log(np.maximum(square[shown] / weight[shown], apart.least[shown] ** 2)))
-        for name, some, count in zip(apart.names, square, weight, strict=True):
-            squares[name], weights[name] = squares[name] + some, weights[name] + count
+            return dict.fromkeys(residuals.names, np.inf), np.full(len(scores), np.inf)
+        by_record = _sum_squares(apart, end.trial)
+        for record, (square, weight) in by_record.items():
+            shown = weight > 0
+            scores[record] = 0.5 * np.mean(np.log(np.maximum(square[shown] / weight[shown], apart.least[shown] ** 2)))
+            for name, some, count in zip(apart.names, square, weight, strict=True):
+                squares[name], weights[name] = squares[name] + some, weights[name] + count
     rms = {name: float(np.sqrt(squares[name] / weights[name])) for name in residuals.names if weights[name]}
     return rms, scores
+
+
+def _sum_squares(residuals: Residuals, trial: Trial) -> dict[int, np.ndarray]:
+    """The weighted sums of squares of residuals, and the sums of weights, (2, S) of each record."""
+    found: dict[int, np.ndarray] = {}
+    for batch, r in zip(residuals.batches, trial.residuals, strict=True):
+        both = np.stack([(batch.weights * r**2).sum(axis=1), batch.weights.sum(axis=1)], axis=1)
+        for row, sums in zip(batch.rows, both, strict=True):
+            record = residuals.pieces[row].record
+            found[record] = found.get(record, 0.0) + sums
+    return found
 
 
 def _select_pieces(residuals: Residuals, keep: np.ndarray) -> Residuals:

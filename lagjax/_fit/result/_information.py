@@ -132,7 +132,7 @@ def information(descent: Descent) -> Information:
     used = free - null.shape[1] + residuals.free_states
     lost = max(effective.sum() / max(effective.sum() - used, 1.0), 1.0)
     robust = np.mean([1.0 if np.isinf(d) else (d + 3) / (d + 1) for d in noise.dof])
-    rows, basis = _parameter_rows(triangles, states, unknowns) / unit, basis * unit[:, None]
+    rows, basis = parameter_rows(triangles, states, unknowns) / unit, basis * unit[:, None]
     half = basis @ np.linalg.solve(basis.T @ (rows.T @ rows) @ basis, basis.T)
     white = robust * half / unit / unit[:, None]
     covariance = lost * robust * half @ middle @ half.T / unit / unit[:, None]
@@ -146,7 +146,7 @@ def information(descent: Descent) -> Information:
 
 def null_space(triangles: np.ndarray, states: int, unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray]:
     """Directions of u (F, K) that nothing depends on, the starts being free; and a basis (F, F − K) of the others."""
-    rows, unit = _parameter_rows(triangles, states, unknowns), _lengths(triangles, states, unknowns)
+    rows, unit = parameter_rows(triangles, states, unknowns), _lengths(triangles, states, unknowns)
     if not len(unit):
         return np.zeros((0, 0)), np.zeros((0, 0))
     # From above zero by its own round-off, so that a column which is noise alone counts as nothing.
@@ -181,7 +181,7 @@ def growth(sizes: list[np.ndarray]) -> float:
     return found
 
 
-def _parameter_rows(triangles: np.ndarray, states: int, unknowns: Unknowns) -> np.ndarray:
+def parameter_rows(triangles: np.ndarray, states: int, unknowns: Unknowns) -> np.ndarray:
     """The rows of the unknowns, orthogonal to those of the starts: a triangle with F columns."""
     own = unknowns.spread(eliminate_starts(triangles, triangles[..., :-1], states))
     return compress_rows(own.reshape(1, own.shape[0] * own.shape[1], own.shape[-1]))[0]

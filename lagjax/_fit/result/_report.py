@@ -150,6 +150,7 @@ def lab_book(fit) -> str:
         parameters = _align(_parameter_cells(fit), {"value": 12, f"{100 * LEVEL:g} % interval": 27})
     noise = _align(_noise_cells(fit), {"RMS": 10, "noise σ": 10, "ν": 8, "samples": 8, "effective": 9})
     lines = [build_title(fit), "", *parameters, "", *noise, ""]
+    lines += [] if fit.selection is None else [*fit.selection.text.splitlines(), ""]
     lines += [f"not seen    {sentence}" for sentence in fit.unseen]
     if fit.waterfall is not None:
         lines.append(f"starts      {fit.waterfall}")

@@ -24,6 +24,7 @@ from lagjax._fit.result._information import LEVEL, Information, information
 from lagjax._fit.result._prediction import Prediction, planned_rows, predict_record
 from lagjax._fit.result._profile import Profile, profile
 from lagjax._fit.result._report import draw_record, lab_book, recordings, render_page
+from lagjax._fit.result._selection import Selection
 from lagjax._fit.result._verdict import verdict
 from lagjax._fit.search._descent import Descent
 from lagjax._fit.search._multistart import Waterfall
@@ -81,6 +82,7 @@ class Fit:
       modes, also whether it leaves no motion of more than some 5 %. `message`: what happened.
     - `log_likelihood`: as if all samples were independent; `trials`: how often the motions were computed.
     - `waterfall`: where the search from each of several starts ended (`Waterfall`); None for a single start.
+    - `selection`: the fits by which candidate terms were chosen (`Selection`); None without `lagjax.terms`.
     """
 
     params: PyTree
@@ -95,6 +97,7 @@ class Fit:
     log_likelihood: float
     trials: int
     waterfall: Waterfall | None
+    selection: Selection | None
     records: tuple[Any, ...]
     parameters: Parameters = field(repr=False)
     u: np.ndarray = field(repr=False)
@@ -107,7 +110,7 @@ class Fit:
 
     @classmethod
     def from_descent(
-        cls, descent: Descent, law: AbstractNoise, waterfall: Waterfall | None
+        cls, descent: Descent, law: AbstractNoise, waterfall: Waterfall | None, selection: Selection | None = None
     ) -> tuple["Fit", Unexplained]:
         residuals, trial, noise = descent.residuals, descent.trial, descent.noise
         parameters, known = residuals.parameters, information(descent)
@@ -116,6 +119,7 @@ class Fit:
         unseen, left = (*unseen_sentences(descent, known), *rest), left._replace(noise=[*left.noise, *rest])
         starts = 1 if waterfall is None else len(waterfall.misfits)
         ok, message = verdict(descent, unseen, known, left, law, starts)
+        ok = ok and not (selection and selection.alike)
         starts = [residuals.restore_state(k, trial.starts[row]) for k, row in enumerate(residuals.firsts)]
         matrices, measured = _record_residuals(residuals, trial), residuals.weights > 0
         samples, squares = measured.sum(axis=0), (trial.flat() ** 2).sum(axis=0, where=measured)
@@ -128,9 +132,9 @@ class Fit:
             residuals=residuals.group_by_system(list(map(restore_structure, matrices, residuals.records))),
             rms=dict(zip(residuals.names, np.sqrt(squares / samples).tolist(), strict=True)),
             unseen=unseen, ok=ok, message=message, log_likelihood=residuals.log_likelihood(trial, noise),
-            trials=descent.trials, waterfall=waterfall, records=tuple(residuals.records), parameters=parameters,
-            u=trial.u, states=trial.starts, law=law, information=known, noise_scale=noise, residual_function=residuals,
-            residual_matrices=matrices,
+            trials=descent.trials, waterfall=waterfall, selection=selection, records=tuple(residuals.records),
+            parameters=parameters, u=trial.u, states=trial.starts, law=law, information=known, noise_scale=noise,
+            residual_function=residuals, residual_matrices=matrices,
         )  # fmt: skip
         return fit, left
 

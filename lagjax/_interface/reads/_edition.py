@@ -60,7 +60,7 @@ class Edition:
         now = self.now()
         if now is not self and now != self:
             raise ValueError(
-                f"{_describe_change(self, now)} Derive the result again with the new value, or set the former one back; "
+                f"{_change_text(self, now)} Derive the result again with the new value, or set the former one back; "
                 "values that change often belong into `params`."
             )
 
@@ -220,7 +220,7 @@ class _LiveWalk(Walk):
             return self.hold(array)
 
 
-def _describe_change(old: Edition, now: Edition) -> str:
+def _change_text(old: Edition, now: Edition) -> str:
     name = getattr(old.function, "__name__", type(old.function).__name__)
     pairs = zip(old.text.split("\n"), now.text.split("\n"), strict=False)
     was, is_now = next(((a.strip(), b.strip()) for a, b in pairs if a != b), ("another value", "this one"))

@@ -85,7 +85,9 @@ _BRANCH = (
 def _blame_phrase(scene: CheckedScene, role: str, order: str) -> str:
     """The end of a sentence: which operation, with which operands, in which line, and what to write instead."""
     wanted = {"value": ("value",), "first": ("value", "first derivative")}.get(order)
-    offending = [o for o in offenders(getattr(scene.motion, role), *scene.state) if not wanted or o.fault in wanted]
+    offending = [
+        o for o in offenders(getattr(scene.written_motion, role), *scene.state) if not wanted or o.fault in wanted
+    ]
     if not offending:
         return ". No single operation is to blame: large numbers may overflow together; look at the units."
     first = offending[0]
@@ -151,7 +153,7 @@ def _kink_finding(scene: CheckedScene, name: str, role: str, along: str, values,
     below, above, derivative = values
     slope = f"The slope of {name} along {along} is {below:.6g} below this state and {above:.6g} above it"
     if role in ("lagrangian", "dissipation"):
-        pieces = describe_pieces([getattr(scene.motion, role)], scene.state)
+        pieces = describe_pieces([getattr(scene.written_motion, role)], scene.state)
         slope += f" (the function is pieced together by {pieces})" if pieces else ""
     of_force = role == "dissipation" or (role == "lagrangian" and not of_velocity)
     if of_force:

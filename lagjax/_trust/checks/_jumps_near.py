@@ -47,10 +47,9 @@ class Discontinuity(NamedTuple):
 
 
 def findings(scene: CheckedScene) -> list[Finding]:
-    pieces = pieces_of_motion(scene.motion, *scene.state)
-    if not pieces:
+    if not pieces_of_motion(scene.motion, *scene.state):
         return []
-    sides = _sides_of_states(scene)
+    pieces, sides = pieces_of_motion(scene.written_motion, *scene.state), _sides_of_states(scene)
     labels = [f"{name}{place}" for name, place, size in pieces for _ in range(size)]
     jumps = [
         _first_jump(scene, sides, scene.point, sign * vector, (name, size), labels)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._equations import Derivation, Sample, Scales, augment, derivation_of, numbers_of, saddle_many
+from lagjax._equations import Derivation, Motion, Sample, Scales, augment, derivation_of, numbers_of, saddle_many
 from lagjax._interface import Layout, as_arrays
 from lagjax._program import Unlowerable
 from lagjax._scene import System
@@ -51,6 +51,11 @@ class CheckedScene(NamedTuple):
     @property
     def motion(self):
         return self.derivation.motion
+
+    @property
+    def written_motion(self) -> Motion:
+        """The motion by the functions of this very system: a derivation serves all systems of one text."""
+        return self.system._motion(self.layout, self.arguments[3])
 
     @property
     def names(self) -> tuple[str, ...]:
