@@ -88,7 +88,7 @@ def lowest_modes(
 
 
 def _solve_shifted(factors: SuperLU, b: np.ndarray) -> np.ndarray:
-    """x (n,) of (K − σM) x = b, by factors that may be bordered by constraints."""
+    """The solution x (n,) of (K − σM) x = b, by factors that may be bordered by constraints."""
     return factors.solve(np.append(b, np.zeros(factors.shape[0] - len(b))))[: len(b)]
 
 

@@ -71,7 +71,7 @@ def jacobian_pattern(function: Callable, shapes: tuple, by: int) -> "scipy.spars
 
 
 def _verify_pattern(pattern: "scipy.sparse.csr_array", function: Callable, leaves: list, by: int) -> bool:
-    """True if products with ∂f/∂x as this pattern reads it off are derivatives of f, at two random states."""
+    """True if ∂f/∂x, read off by this pattern, gives the derivatives of f along vectors, at two random states."""
     # Rows that are full are read off by products from the left.
     full = bool(np.diff(pattern.indptr).max(initial=0) > _MOST_TESTED)
     pattern = scipy.sparse.csr_array(pattern.T) if full else pattern

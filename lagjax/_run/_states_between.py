@@ -116,7 +116,7 @@ class LanePlaces(NamedTuple):
         ahead, outputs, last = way * times, way * ts, ts.shape[1] - 1
         inside = (ahead >= outputs[:, :1]) & (ahead <= outputs[:, -1:])
         if xp is np and not inside.all():
-            raise ValueError(_say_outside(ts, times, inside))
+            raise ValueError(_explain_outside(ts, times, inside))
         output = xp.clip(_search_rows(xp, outputs, ahead), 0, last)
         rows = np.arange(len(ts))[:, None]
         is_output = inside & (ts[rows, output] == times)
@@ -233,7 +233,7 @@ def _require_settings(run: Trajectory) -> RunSettings:
     return run.settings
 
 
-def _say_outside(ts: np.ndarray, times: np.ndarray, inside: np.ndarray) -> str:
+def _explain_outside(ts: np.ndarray, times: np.ndarray, inside: np.ndarray) -> str:
     member, k = np.argwhere(~inside)[0]
     of = f" of member {member}" if len(ts) > 1 else ""
     return (

@@ -212,7 +212,7 @@ def _path_units(arcs: Arcs, y, ends, times) -> Units:
 
 
 def _guess_states(layout: Layout, guess, ends, times) -> np.ndarray:
-    """States (K, 2n) at the first times of the arcs."""
+    """The guessed states (K, 2n) at the first times of the arcs."""
     q_start, q_end = ends
     if guess is None:
         slope = (q_end - q_start) / (times[-1] - times[0])

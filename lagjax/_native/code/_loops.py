@@ -142,7 +142,7 @@ _engines: list = []  # which hold the code
 
 
 def _digest_sources(entries: tuple[Loop, ...]) -> str:
-    """A digest of the text of this package, and of the files of these: there are all loops, and constants they know."""
+    """A digest of the text of this package and of the files of these loops, with the constants that they read."""
     digest, own = hashlib.sha256(), {Path(inspect.getfile(entry.function)) for entry in entries}
     for path in sorted({*Path(__file__).parents[2].rglob("*.py"), *own}):
         digest.update(path.read_bytes())

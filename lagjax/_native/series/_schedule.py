@@ -115,7 +115,7 @@ def _needed_operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> li
 def _separate_outputs(
     line: StraightLine, operations: list[ScheduledOperation], kinds: _Kinds, staying: int
 ) -> tuple[dict[int, int], list[ScheduledOperation]]:
-    """The first outputs that nodes are, and copies for all others: that for output k of N nodes is node N + k."""
+    """The node of each output: a node that is an output already is copied, for output k of N nodes to node N + k."""
     made = {x for operation in operations for x in operation.results}
     outputs: dict[int, int] = {}
     copies = []

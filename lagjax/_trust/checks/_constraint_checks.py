@@ -23,7 +23,7 @@ def findings(scene: CheckedScene) -> list[Finding]:
         return [_check_finite(names[k], residual[k]) for k in bad]
     positions = scene.derivation.position_count
     idle = [k for k in range(len(names)) if not jacobian[0, k].any()]
-    reported = [_check_idle(names[k], k >= positions, residual[k], jacobian[:, k]) for k in idle]
+    reported = [_check_zero_gradients(names[k], k >= positions, residual[k], jacobian[:, k]) for k in idle]
     reported += _check_affine(names, jacobian, positions, scene.layout)
     if idle:
         return reported
@@ -47,7 +47,7 @@ def _check_finite(name: str, value) -> Finding:
     return Finding("constraint_not_finite", "error", (name,), message)
 
 
-def _check_idle(name: str, of_velocities: bool, value, rows: np.ndarray) -> Finding:
+def _check_zero_gradients(name: str, of_velocities: bool, value, rows: np.ndarray) -> Finding:
     """A constraint whose gradient is zero: of no use here, and often an inequality or a square."""
     if of_velocities:
         message = (
