@@ -34,7 +34,7 @@ from lagjax._fit.model._sensors import Delayed, wrapped
 from lagjax._fit.model._timings import Timings
 from lagjax._fit.model._transforms import Smooth, angle, between, inertia, positive, simplex
 from lagjax._fit.result._comparison import Comparison
-from lagjax._fit.result._evidence import find_smoothness
+from lagjax._fit.result._evidence import begin_weakly, find_smoothness
 from lagjax._fit.result._experiments import Experiments
 from lagjax._fit.result._mistakes import SECONDS, find_mistake, possible_mistakes
 from lagjax._fit.result._prediction import Prediction
@@ -204,6 +204,7 @@ class _FitSearch(NamedTuple):
         u = parameters.inverse(parameters.first)
         point, waterfall = Point(u, first_starts(residuals, readers, self.params0)), None
         residuals, point = _keep_unused(residuals, point)
+        residuals = begin_weakly(residuals, point, self.law)
         if self.progress:
             residuals.watch = _print_trials(residuals.size)
         search = Search(residuals, self.law, self.method, readers)

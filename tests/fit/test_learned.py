@@ -135,6 +135,22 @@ def test_a_rougher_function_has_a_weaker_prior():
     assert found[0] < found[1] - 0.5
 
 
+@pytest.mark.parametrize("mass", [1e-9, pytest.param(1e9, marks=pytest.mark.slow)])
+def test_other_units_change_no_digit(mass):
+    """A potential in other units of energy, with a mass in other units, has the same motion and the same evidence."""
+
+    def learn(mass):
+        scene = lagjax.System(lambda q, v, params: 0.5 * mass * v**2 - WELL(q, params=params))
+        return lagjax.fit(scene, records, WELL.params0)
+
+    records = record_motion(well, [(1.45, 0.1)], WELL.interpolate(double_well), noise=1e-2, end=6.0)
+    one, other = learn(1.0), learn(mass)
+    scale = np.abs(one.params["spline"]).max()
+    np.testing.assert_allclose(other.params["spline"] / mass, one.params["spline"], atol=1e-4 * scale)
+    np.testing.assert_allclose(other.covariance.matrix / mass**2, one.covariance.matrix, rtol=1e-2, atol=1e-6 * scale)
+    assert one.ok and other.ok and one.message == other.message
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
