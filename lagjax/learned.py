@@ -209,7 +209,7 @@ class FreeFunction(AbstractLaw):
             for j in range(count):
                 orders = [(i == k) + (j == k) for k in range(count)]
                 total += functools.reduce(np.kron, [grams[k][order] for k, order in enumerate(orders)])
-        return {"spline": Smooth.from_roughness(total, self.gauge, line=count == 1)}
+        return {"spline": Smooth.from_roughness(total, self.gauge, self.knots[0] if count == 1 else None)}
 
 
 def potential(range: Any, count: Any = 20, periodic: Any = False) -> FreeFunction:

@@ -416,7 +416,8 @@ class Smooth(AbstractTransform):
     along those that are not rough at all.
 
     So a prior density exp(−λ |D x|²/2), with λ the `strength`, is one of independent u. `basis` (n, m) is B, `back`
-    (m, n) its inverse, `rough` (m,) is 1 or 0 for each of the u; `line`: whether the function has one argument.
+    (m, n) its inverse, `rough` (m,) is 1 or 0 for each of the u; `knots` (n,) are the places of the numbers, None of
+    several arguments.
     """
 
     reach: ClassVar[float] = np.inf
@@ -425,11 +426,11 @@ class Smooth(AbstractTransform):
     basis: np.ndarray
     back: np.ndarray
     rough: np.ndarray
-    line: bool
+    knots: np.ndarray | None
     strength: float = 1e-6
 
     @classmethod
-    def from_roughness(cls, square: np.ndarray, gauge: bool, line: bool) -> "Smooth":
+    def from_roughness(cls, square: np.ndarray, gauge: bool, knots: np.ndarray | None) -> "Smooth":
         """The map of numbers whose roughness is xᵀ `square` x; with `gauge` a constant is no part of them."""
         sizes, vectors = np.linalg.eigh(square)
         rough = sizes > _STRAIGHT * sizes[-1]
@@ -440,7 +441,7 @@ class Smooth(AbstractTransform):
         scale = np.sqrt(sizes[rough])
         basis = np.concatenate([straight, vectors[:, rough] / scale], axis=1)
         back = np.concatenate([straight.T, scale[:, None] * vectors[:, rough].T])
-        return cls(basis, back, (np.arange(basis.shape[1]) >= straight.shape[1]).astype(float), line)
+        return cls(basis, back, (np.arange(basis.shape[1]) >= straight.shape[1]).astype(float), knots)
 
     def count_unknowns(self, count):
         return self.basis.shape[1]

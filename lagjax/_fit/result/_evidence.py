@@ -128,17 +128,16 @@ def _data_square(residuals: Residuals, trial: Trial, noise: NoiseScale) -> np.nd
 
 
 def _sentence(done: Descent, part: SmoothPart) -> str:
-    """A sentence: how many numbers of a learned function the data determine, and between which of its knots."""
+    """A sentence: how many numbers of a learned function the data determine, and between which places they show it."""
     square, prior = _data_square(done.residuals, done.trial, done.noise), done.residuals.parameters.prior_weights
     covariance = np.linalg.inv(square + np.diag(prior**2) + _floor(square))
     determined = len(part.rough) - part.transform.strength * np.diag(covariance)[part.rough].sum()
     text = f"Data determine {determined:.1f} numbers of the shape of {part.label}"
-    count = len(part.transform.basis)
     bends = np.diff(part.transform.basis, n=2, axis=0)
     before = np.sum((bends * part.transform.rough) ** 2, axis=1) / part.transform.strength
     after = np.einsum("kf,fg,kg->k", bends, covariance[part.own, part.own], bends)
     seen = 1 + np.flatnonzero(after < _SEEN * before)
-    if not seen.size or not part.transform.line:
+    if not seen.size or (knots := part.transform.knots) is None:
         return f"{text}."
-    where = f"seen from knot {seen[0] + 1} to knot {seen[-1] + 1} of {count}"
+    where = f"seen from {knots[seen[0]]:.3g} to {knots[seen[-1]]:.3g}"
     return f"{text}, which was {where}; beyond, its interval is its prior's."
