@@ -245,7 +245,7 @@ def draw_followed(scene, tosses, laws, off):
     for name, (errors, color) in off.items():
         left.scatter(errors.place, errors.angle, s=14, color=color, label=name)
         left.scatter(*errors.medians(), s=140, marker="+", color=color)
-    left.set(xscale="log", yscale="log", xlabel="place [half sides]", ylabel="angle [rad]")
+    left.set(yscale="log", xlabel="place [half sides]", ylabel="angle [rad]")
     left.set_title(f"off after {LATER} s (+ medians)")
     left.legend(fontsize=8)
 
