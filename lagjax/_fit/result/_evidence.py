@@ -6,18 +6,21 @@ square of its weighted derivatives, so that the integral is known, and is larges
 
     λ = γ / Σ u²      γ = Σ (1 − λ C_kk)      C = (H + λ)⁻¹
 
-γ is the number of unknowns that the recordings determine. The fixed point is found in the linear model, then the
+γ is the number of unknowns that the recordings determine. Where residuals are correlated the data tell a share of H,
+and a search, which counts every sample, has the strength λ over that share. The fixed point is found in the linear model, then the
 motion is fitted anew, and so forth, until λ stays.
 
 Source: MacKay, Neural Computation 4 (1992) 415, eqs. 4.6 to 4.9.
 """
 
 import contextlib
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
+from lagjax._fit.model._autocorrelation import independent_share
 from lagjax._fit.model._noise import AbstractNoise, NoiseScale
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals, Trial
@@ -26,7 +29,7 @@ from lagjax._fit.result._information import parameter_rows
 from lagjax._fit.search._descent import Descent, minimise
 
 _ENOUGH, _TRIALS = 1e-3, 60  # of each search, as of the first
-_ROUNDS = 12  # of fits, most of which take two trials
+_ROUNDS = 20  # of fits, most of which take two trials
 _SAME = 0.1  # |log λ| between two fits: intervals differ by a hundredth
 _INNER, _INNER_SAME = 200, 1e-3  # rounds in the linear model
 # λ over what data say of an unknown: a function that data determine at every knot, and one that is a straight line.
@@ -62,11 +65,13 @@ def find_smoothness(done: Descent, law: AbstractNoise, tell: Callable[[str], Non
     """The fit with the strengths of priors that evidence asks for, from one with any; unchanged without priors."""
     if not smooth_parts(done.residuals.parameters):
         return done
-    trials = done.trials
-    for _ in range(_ROUNDS):
+    trials, text = done.trials, "The smoothness did not settle."
+    for k in range(_ROUNDS):
         parts = smooth_parts(done.residuals.parameters)
-        strengths = _strengths(done, parts)
-        moved = max(abs(np.log(strengths[part.label] / part.transform.strength)) for part in parts)
+        before, wanted = {part.label: part.transform.strength for part in parts}, _strengths(done, parts)
+        moved = max(abs(np.log(wanted[name] / before[name])) for name in before)
+        # The first strength is any. Then half a step: correlation of residuals depends on what a prior leaves.
+        strengths = wanted if k == 0 else {name: math.sqrt(before[name] * wanted[name]) for name in before}
         residuals = done.residuals.with_parameters(done.residuals.parameters.with_strengths(strengths))
         again = minimise(residuals, done.trial.point, law, _ENOUGH, _TRIALS)
         trials += again.trials
@@ -74,8 +79,10 @@ def find_smoothness(done: Descent, law: AbstractNoise, tell: Callable[[str], Non
         if tell is not None:
             tell(", ".join(f"{name}: strength {value:.3g}" for name, value in strengths.items()))
         if moved < _SAME:
+            text = ""
             break
-    said = [_sentence(done, part) for part in smooth_parts(done.residuals.parameters)]
+    done = done._replace(converged=done.converged and not text)
+    said = [text] * bool(text) + [_sentence(done, part) for part in smooth_parts(done.residuals.parameters)]
     return done._replace(trials=trials, message=" ".join([done.message, *said]))
 
 
@@ -92,6 +99,7 @@ def _strengths(done: Descent, parts: list[SmoothPart]) -> dict[str, float]:
     """λ of each learned function, by label: the fixed point in the model that is linear about a fit."""
     square, prior = _data_square(done.residuals, done.trial, done.noise), done.residuals.parameters.prior_weights
     target = square @ done.trial.u + prior**2 * done.trial.u
+    share = independent_share(done.residuals, done.trial, done.noise)
     precision, found = prior**2, {part.label: part.transform.strength for part in parts}
     for _ in range(_INNER):
         covariance = np.linalg.inv(square + np.diag(precision) + _floor(square))
@@ -100,7 +108,7 @@ def _strengths(done: Descent, parts: list[SmoothPart]) -> dict[str, float]:
             before, own = found[part.label], u[part.rough]
             determined = max(len(own) - before * float(np.diag(covariance)[part.rough].sum()), 1e-6)
             ends = np.array([_WEAKEST, _STRONGEST]) * _mean_information(square, part)
-            value = float(np.clip(determined / max(float(own @ own), np.finfo(float).tiny), *ends))
+            value = float(np.clip(determined / max(share * float(own @ own), np.finfo(float).tiny), *ends))
             moved = max(moved, abs(np.log(value / before)))
             found[part.label] = value
             precision[part.rough] = value

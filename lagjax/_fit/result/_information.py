@@ -109,7 +109,8 @@ def information(descent: Descent) -> Information:
     effective, correlation = (np.array(x) for x in zip(*((a.count / a.time, a.neighbour) for a in laws), strict=True))
     unit = _lengths(triangles, states, unknowns)  # of columns: their squares may be no numbers
     unit_of = np.append(unit, 1.0)[unknowns.columns][:, None, None]
-    middle, rows_of = np.diag((prior / unit) ** 2), []
+    share = effective.sum() / max(sum(law.count for law in laws), 1)  # a prior is worth more beside correlated samples
+    middle, rows_of = np.diag((prior / unit) ** 2 / share), []
     for batch, factor, slopes in zip(residuals.batches, factors, trial.slopes, strict=True):
         own, columns = factor[..., None] * slopes, unknowns.select(batch.rows)
         own = eliminate_starts(triangles[batch.rows], own, states) / unit_of[batch.rows]
