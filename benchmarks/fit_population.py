@@ -28,7 +28,7 @@ import collections
 import functools
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -410,11 +410,12 @@ GUESSED = {
 }
 
 
-def print_guesses(count: int) -> None:
+def print_guesses(count: int, names: Iterable[str]) -> None:
     """One line for each scene: how many of the fits from these guesses are right, not ok, and wrong and ok."""
     head = ("in 95 %", "right", "not ok", "wrong", "CPU s")
     print(f"\n{f'one record, {count} guesses':<26}" + "".join(f"{word:>8}" for word in head))
-    for name, (scene, truth, start, end, sigma) in GUESSED.items():
+    for name in names:
+        scene, truth, start, end, sigma = GUESSED[name]
         rng, begun = np.random.default_rng(0), time.process_time()
         record = recorded(scene, start, np.linspace(0.0, end, 161), truth, rng, sigma)
         became, held = collections.Counter(), 0
@@ -458,6 +459,9 @@ def main(argv=None) -> dict[str, Any]:
     parser.add_argument("--honest", type=int, default=30, help="fits without one")
     parser.add_argument("--kinds", type=int, default=0, help="fits in each kind of scene, every other with a mistake")
     parser.add_argument("--guesses", type=int, default=0, help="guesses from which one record of each scene is fitted")
+    parser.add_argument(
+        "--scenes", nargs="+", choices=tuple(GUESSED), default=tuple(GUESSED), help="those of --guesses"
+    )
     parser.add_argument("--only", type=int, nargs="*", help="seeds to run alone, with all that they say")
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", not options.float32)
@@ -482,7 +486,7 @@ def main(argv=None) -> dict[str, Any]:
     )
     print(f"{'all mistakes':<26}" + "".join(f"{total[kind]:>8}" for kind in kinds))
     if options.guesses:
-        print_guesses(options.guesses)
+        print_guesses(options.guesses, options.scenes)
     return {mistake: dict(count) for mistake, count in counts.items()}
 
 
