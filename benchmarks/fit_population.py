@@ -47,7 +47,7 @@ SIGMA = 3e-3  # noise, in rad or m: a fraction of a percent of the signals
 class Case(NamedTuple):
     """A scene with the truth, the times, which coordinates are angles, which parameters a unit of time changes."""
 
-    system: lagjax.System
+    system: Any  # a System or a Hybrid
     truth: dict[str, float]
     ts: np.ndarray
     angles: tuple[int, ...]
@@ -135,7 +135,7 @@ def motion(case: Case, q0, v0, params, rng) -> np.ndarray:
 def spoil(case: Case, mistake: str | None, rng) -> Spoiled:
     """Records of a scene with one mistake, None for none."""
     if case.draw is not None:
-        return spoil_kind(case, mistake, rng)
+        return spoil_kind(case, case.draw, mistake, rng)
     values, ts, truth = drawn(case, rng, mistake == "wrapped"), case.ts, case.truth
     which, column = int(rng.integers(RECORDS)), int(rng.integers(case.size))
     mine = re.escape(f"records[{which}]")
@@ -186,9 +186,9 @@ def spoil(case: Case, mistake: str | None, rng) -> Spoiled:
     return Spoiled([lagjax.Record(t, one) for t, one in zip(times, values, strict=True)], words, truth)
 
 
-def spoil_kind(case: Case, mistake: str | None, rng) -> Spoiled:
+def spoil_kind(case: Case, draw: Callable[..., Any], mistake: str | None, rng) -> Spoiled:
     """Records of one of the `KINDS`, with one of the mistakes that each of them can have."""
-    records, more = case.draw(rng, case.truth)
+    records, more = draw(rng, case.truth)
     which = int(rng.integers(len(records)))
     spoiled, words = records[which], re.escape(f"records[{which}]")
     if mistake == "shifted":
@@ -201,7 +201,7 @@ def spoil_kind(case: Case, mistake: str | None, rng) -> Spoiled:
         spoiled = replace(spoiled, values=jax.tree.map(np.negative, spoiled.values))
     elif mistake == "another machine":
         name = rng.choice(list(case.truth))
-        others, _ = case.draw(rng, {**case.truth, name: case.truth[name] * rng.choice([0.7, 1.4])})
+        others, _ = draw(rng, {**case.truth, name: case.truth[name] * rng.choice([0.7, 1.4])})
         spoiled = others[which]
     records = [spoiled if k == which else record for k, record in enumerate(records)]
     return Spoiled(records, words if mistake else "", case.truth | more)
