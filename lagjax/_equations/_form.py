@@ -39,7 +39,8 @@ BYTES_OF_ENTRY = 20
 
 # ---- sparse arrays ---------------------------------------------------------------------------------------------------
 
-# Coordinates from which patterns of zeros are looked for: below, machine code is as quick.
+# Coordinates from which patterns of zeros are looked for: a ring of 90 takes 0.5 s to a first result by machine code,
+# 4 s by arrays.
 LEAST_COORDINATES = 100
 # Scalar operations of L from which such a scene runs on arrays: a ring of 1000 (11 000) takes 3.5 s to a first one by
 # machine code, 2 s by arrays, whose time hardly grows; a batch of 256 rings of 300 is 30 times faster in machine code.
