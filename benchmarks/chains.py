@@ -102,7 +102,7 @@ def follow(scene, starts: np.ndarray, step: float, long: float) -> np.ndarray:
         def flat_rate(t, y, shape=some.shape):
             return np.ravel(rate(y.reshape(shape)))
 
-        done = solve_ivp(flat_rate, (0.0, ts[-1]), some.ravel(), "DOP853", ts, rtol=1e-13, atol=1e-13)
+        done = solve_ivp(flat_rate, (0.0, ts[-1]), some.ravel(), "DOP853", ts, rtol=1e-12, atol=1e-12)
         found.append(done.y.reshape(*some.shape, len(ts)).swapaxes(1, 2))
     return np.concatenate(found)
 
