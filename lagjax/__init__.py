@@ -48,6 +48,7 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 
 - `sweep`: up to 10⁸ members in a `Store`, as a `Sweep`, with its `Statistics` (a `Summary` each) and `Status`
 - `designs`: points to sweep over: random, Sobol's, Latin hypercubes
+- `learned`: functions that nobody wrote down, learned from recordings: potentials, friction, inertia
 
 **More**
 
@@ -67,7 +68,7 @@ from lagjax._interface import VERSION, Registered, register
 from lagjax._scene import System
 
 if TYPE_CHECKING:  # each is imported on first use: all of them take as long as JAX itself
-    from lagjax import designs, plot, results, scenes
+    from lagjax import designs, learned, plot, results, scenes
     from lagjax._analysis import (
         change_coordinates,
         conserved_quantities,
@@ -126,9 +127,10 @@ __all__ = [
     "RESULTS", "Clipped", "Delayed", "FineOutput", "Gaussian", "Guess", "Hybrid", "MachineCode", "Quantised", "Record",
     "SimulationError", "Statistics", "Store", "StudentT", "Sweep", "System", "Timings", "Transition", "action", "angle",
     "between", "branch_off", "change_coordinates", "check", "conserved_quantities", "crossings", "cyclic_coordinates",
-    "designs", "equilibrium", "family", "find_path", "fit", "hamiltonian", "inertia", "inverse_dynamics", "linearize",
-    "lyapunov_exponent", "lyapunov_spectrum", "noether_charge", "normal_modes", "per_record", "periodic_orbit", "plot",
-    "positive", "results", "routhian", "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch",
+    "designs", "equilibrium", "family", "find_path", "fit", "hamiltonian", "inertia", "inverse_dynamics", "learned",
+    "linearize", "lyapunov_exponent", "lyapunov_spectrum", "noether_charge", "normal_modes", "per_record",
+    "periodic_orbit", "plot", "positive", "results", "routhian", "same_motion", "samples",
+    "scenes", "simplex", "simulate", "simulate_batch",
     "steady_motion", "sweep", "terms", "work_precision", "wrapped",
 ]  # fmt: skip
 

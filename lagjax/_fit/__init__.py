@@ -25,15 +25,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._fit.model._assembly import GivenSystem, assemble_residuals, read_systems
-from lagjax._fit.model._law_parameters import find_laws, terms
+from lagjax._fit.model._law_parameters import AbstractLaw, LawParameters, find_laws, terms
 from lagjax._fit.model._noise import AbstractNoise, Clipped, Gaussian, Quantised, StudentT
 from lagjax._fit.model._parameters import Parameters, per_record
 from lagjax._fit.model._records import Guess, Record, require_untraced
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals
 from lagjax._fit.model._sensors import Delayed, wrapped
 from lagjax._fit.model._timings import Timings
-from lagjax._fit.model._transforms import angle, between, inertia, positive, simplex
+from lagjax._fit.model._transforms import Smooth, angle, between, inertia, positive, simplex
 from lagjax._fit.result._comparison import Comparison
+from lagjax._fit.result._evidence import begin_weakly, find_smoothness
 from lagjax._fit.result._experiments import Experiments
 from lagjax._fit.result._mistakes import SECONDS, find_mistake, possible_mistakes
 from lagjax._fit.result._prediction import Prediction
@@ -203,6 +204,7 @@ class _FitSearch(NamedTuple):
         u = parameters.inverse(parameters.first)
         point, waterfall = Point(u, first_starts(residuals, readers, self.params0)), None
         residuals, point = _keep_unused(residuals, point)
+        residuals = begin_weakly(residuals, point, self.law)
         if self.progress:
             residuals.watch = _print_trials(residuals.size)
         search = Search(residuals, self.law, self.method, readers)
@@ -223,6 +225,7 @@ class _FitSearch(NamedTuple):
                 descent = max(descent, other, key=lambda one: one.residuals.log_likelihood(one.trial, one.noise))
             descent = search_again(descent, self.law)
         residuals.watch = descent.residuals.watch = None
+        descent = find_smoothness(descent, self.law, _print_line if self.progress else None)
         laws, selection = [law for law in find_laws(self.params0) if law.law.selects], None
         if laws and looks_further:
             tell = _print_line if self.progress else None

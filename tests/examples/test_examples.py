@@ -85,12 +85,17 @@ def test_a_cube_comes_to_rest_on_a_face(tmp_path, monkeypatch):
     assert_pictures([tmp_path / "out" / "cube.png"], tmp_path / "out", 1)
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # three hundred tosses, whose corners strike ten times each
 @pytest.mark.skipif(not TOSSES.exists(), reason="the recorded tosses are not here")
 def test_recorded_tosses_of_a_cube(tmp_path, monkeypatch, capsys):
-    """By published numbers alone: half a side and 20° would be those of another face in a third of the tosses."""
+    """Half a side and 20° would be those of another face in a third of the tosses."""
     monkeypatch.chdir(tmp_path)
-    off = importlib.import_module("cube").main([str(TOSSES), "--count", "8"])
-    place, angle = np.median(off[:, :2], axis=0)
-    assert place < 0.5 and angle < 0.35 and off[:, 2].all()
-    assert capsys.readouterr().out.splitlines()[-1].startswith("rolled out: 8 tosses, place ")
+    with np.load(TOSSES) as data:
+        few = int(data["lengths"][:8].sum())
+        np.savez(tmp_path / "few.npz", states=data["states"][:few], lengths=data["lengths"][:8])
+    laws, off = importlib.import_module("cube").main([str(TOSSES), "--follow", str(tmp_path / "few.npz")])
+    assert 0.1 < laws["friction"] < 0.25 and abs(laws["height"]) < 0.05
+    place, angle = off["fitted"].medians()
+    assert place < 0.5 and angle < 0.35 and np.isfinite(off["fitted"].place).all()
+    assert capsys.readouterr().out.splitlines()[-1].startswith("followed: 8 tosses, place ")
+    assert_pictures([tmp_path / "out" / "cube_followed.png"], tmp_path / "out", 1)

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 
 import jax
 
+from lagjax._fit.model._transforms import AbstractTransform
+
 PyTree = Any
 _BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
 
@@ -21,6 +23,7 @@ class AbstractLaw:
     """A function of a scene, known by its identity, whose numbers are a branch of the scene's parameters."""
 
     selects = False  # whether a fit chooses which of the numbers are not zero
+    transforms: Mapping[str, AbstractTransform] = {}  # of its numbers, by name, that a fit smooths
 
     @property
     def params0(self) -> "LawParameters":

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._fit.model._law_parameters import plain_dicts
+from lagjax._fit.model._law_parameters import find_laws, plain_dicts
 from lagjax._fit.model._transforms import AbstractTransform, Unbounded
 from lagjax._interface import as_arrays, labelled_leaves, require_finite
 
@@ -91,10 +91,15 @@ class Parameters:
         labels, leaves, tree = labelled_leaves(as_arrays(params, np.float64, "params0"), "params")
         is_free = _broadcast_prefix(True if free is None else free, tree, leaves, "free")
         moved_by = _broadcast_prefix(Unbounded() if transforms is None else transforms, tree, leaves, "transforms")
+        learned = {
+            f"{one.label}[{name!r}]": own for one in find_laws(params) for name, own in one.law.transforms.items()
+        }
         numbers, places, names, parts, count = [np.zeros(0)], [np.zeros((records, 0), int)], [], [], 0
         for label, leaf, may_move, transform in zip(labels, leaves, is_free, moved_by, strict=True):
             if not eqx.is_array_like(leaf):
                 continue
+            if label in learned:
+                transform = _require_own_transform(label, transform, learned[label])
             fitted, values = _fitted_mask(label, leaf, may_move, free), np.asarray(leaf, np.float64).ravel()
             shape, copies = np.shape(leaf), 1
             if may_move is per_record and fitted.any():
@@ -227,6 +232,21 @@ class Parameters:
     def log_volume(self, u, xp: Any = np):
         """log of the volume of the free numbers per volume of u, up to a constant."""
         return sum(part.transform.log_volume(u[own], xp) for own, _, part in self.cuts)
+
+    @functools.cached_property
+    def prior_weights(self) -> np.ndarray:
+        """The weights w (F,) of a prior density exp(−Σ (w u)²/2) of the unknowns: zero but for learned functions."""
+        each = (part.transform.prior_weights(rows.stop - rows.start) for _, rows, part in self.cuts)
+        return np.concatenate([np.zeros(0), *each])
+
+    def with_strengths(self, strengths: dict[str, float]) -> "Parameters":
+        """The same with other strengths of the priors of learned functions, by the labels of their leaves."""
+        parts = tuple(
+            part._replace(transform=replace(part.transform, strength=strengths[part.label]))
+            if part.label in strengths else part
+            for part in self.parts
+        )  # fmt: skip
+        return replace(self, parts=parts)
 
     def draw(self, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Another place (F,) to begin a search from; the numbers of one record, like its start, follow the others."""
@@ -436,6 +456,12 @@ def _broadcast_prefix(prefix: PyTree, tree, leaves: list, name: str) -> list:
             f"{name} must be one value for all parameters, or name every one of them as params0 does; got {prefix!r}. "
             f"The parameters are {', '.join(labelled_leaves(whole, 'params')[0][:12])}."
         ) from None
+
+
+def _require_own_transform(label: str, given, own: AbstractTransform) -> AbstractTransform:
+    if not (given is None or isinstance(given, Unbounded)):
+        raise ValueError(f"{label} has a transform of its own, {own!r}; got {given!r} in transforms: leave it out.")
+    return own
 
 
 def _require_several(label: str, records: int) -> int:

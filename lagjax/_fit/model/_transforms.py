@@ -24,6 +24,7 @@ import numpy as np
 from scipy.linalg import helmert
 
 PyTree = Any
+_STRAIGHT = 1e-10  # of the largest roughness: below it a function is not rough but by rounding
 
 
 class AbstractTransform(abc.ABC):
@@ -88,6 +89,10 @@ class AbstractTransform(abc.ABC):
     def take_step(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:
         """The end of a step (m,) from u (m,)."""
         return u + step
+
+    def prior_weights(self, count: int) -> np.ndarray:
+        """The weights w (m,) of a prior density exp(−Σ (w u)²/2) of the u of a leaf of n = `count` numbers."""
+        return np.zeros(self.count_unknowns(count))
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -403,6 +408,68 @@ class Inertia(AbstractTransform):
 
     def __repr__(self) -> str:
         return "lagjax.inertia"
+
+
+@dataclass(frozen=True, eq=False)
+class Smooth(AbstractTransform):
+    """x = B u: the numbers of a function that is rough by |D x|², along directions that are rough by |u_k|² each, and
+    along those that are not rough at all.
+
+    So a prior density exp(−λ |D x|²/2), with λ the `strength`, is one of independent u. `basis` (n, m) is B, `back`
+    (m, n) its inverse, `rough` (m,) is 1 or 0 for each of the u; `knots` (n,) are the places of the numbers, None of
+    several arguments.
+    """
+
+    reach: ClassVar[float] = np.inf
+    room: ClassVar[float] = np.inf
+
+    basis: np.ndarray
+    back: np.ndarray
+    rough: np.ndarray
+    knots: np.ndarray | None
+    strength: float = 1e-6
+
+    @classmethod
+    def from_roughness(cls, square: np.ndarray, gauge: bool, knots: np.ndarray | None) -> "Smooth":
+        """The map of numbers whose roughness is xᵀ `square` x; with `gauge` a constant is no part of them."""
+        sizes, vectors = np.linalg.eigh(square)
+        rough = sizes > _STRAIGHT * sizes[-1]
+        straight = vectors[:, ~rough]
+        if gauge:
+            one = np.ones(len(square)) / np.sqrt(len(square))
+            straight = np.linalg.svd(straight - np.outer(one, one @ straight))[0][:, : straight.shape[1] - 1]
+        scale = np.sqrt(sizes[rough])
+        basis = np.concatenate([straight, vectors[:, rough] / scale], axis=1)
+        back = np.concatenate([straight.T, scale[:, None] * vectors[:, rough].T])
+        return cls(basis, back, (np.arange(basis.shape[1]) >= straight.shape[1]).astype(float), knots)
+
+    def count_unknowns(self, count):
+        return self.basis.shape[1]
+
+    def prior_weights(self, count):
+        return np.sqrt(self.strength) * self.rough
+
+    def value(self, u, xp: Any = np):
+        return xp.asarray(self.basis, u.dtype) @ u
+
+    def jacobian(self, u):
+        return self.basis
+
+    def inverse(self, x):
+        return self.back @ x
+
+    def ends(self, x, spread):
+        return x - spread, x + spread
+
+    def draw(self, u, rng):
+        """The same u: there is one least for a smoothness."""
+        return u
+
+    def log_volume(self, u, xp: Any = np):
+        return xp.sum(0.0 * u)
+
+    def __repr__(self) -> str:
+        return "that of a learned function"
 
 
 def _logistic(u, xp: Any = np):

@@ -42,7 +42,8 @@ def unseen_sentences(descent: Descent, known: Information) -> tuple[str, ...]:
         other = residuals.evaluate(Point(near, trial.starts))
         factors = [np.sqrt(batch.weights) / descent.noise.sigma for batch in residuals.batches]
         triangles = residuals.triangles(other, factors)
-        there = confirmed_null(residuals, other, null_space(triangles, residuals.states, residuals.unknowns)[0])
+        there = null_space(triangles, residuals.states, residuals.unknowns, parameters.prior_weights)[0]
+        there = confirmed_null(residuals, other, there)
         spaces.append((parameters.jacobian(near) @ there, parameters.values(near)))
     blocks, elements = _blocks(spaces[0][0]), np.array(parameters.elements)
     alone = [int(block[0]) for block in blocks if len(block) == 1]

@@ -96,7 +96,8 @@ def information(descent: Descent) -> Information:
     residuals, trial, noise = descent.residuals, descent.trial, descent.noise
     factors = residuals.fisher_factors(trial, noise)
     triangles, unknowns = residuals.triangles(trial, factors), residuals.unknowns
-    null, basis = null_space(triangles, residuals.states, unknowns)
+    prior = residuals.parameters.prior_weights
+    null, basis = null_space(triangles, residuals.states, unknowns, prior)
     # Growth alone is not enough: a drive that sets in smoothly begins with rows as small as numbers can be.
     free, states = len(trial.u), residuals.states
     sizes = np.append(residuals.parameters.sizes(trial.u), 0.0)[unknowns.columns][:, None, None]
@@ -108,7 +109,7 @@ def information(descent: Descent) -> Information:
     effective, correlation = (np.array(x) for x in zip(*((a.count / a.time, a.neighbour) for a in laws), strict=True))
     unit = _lengths(triangles, states, unknowns)  # of columns: their squares may be no numbers
     unit_of = np.append(unit, 1.0)[unknowns.columns][:, None, None]
-    middle, rows_of = np.zeros((free, free)), []
+    middle, rows_of = np.diag((prior / unit) ** 2), []
     for batch, factor, slopes in zip(residuals.batches, factors, trial.slopes, strict=True):
         own, columns = factor[..., None] * slopes, unknowns.select(batch.rows)
         own = eliminate_starts(triangles[batch.rows], own, states) / unit_of[batch.rows]
@@ -133,6 +134,7 @@ def information(descent: Descent) -> Information:
     lost = max(effective.sum() / max(effective.sum() - used, 1.0), 1.0)
     robust = np.mean([1.0 if np.isinf(d) else (d + 3) / (d + 1) for d in noise.dof])
     rows, basis = parameter_rows(triangles, states, unknowns) / unit, basis * unit[:, None]
+    rows = np.concatenate([rows, np.diag(prior / unit)])
     half = basis @ np.linalg.solve(basis.T @ (rows.T @ rows) @ basis, basis.T)
     white = robust * half / unit / unit[:, None]
     covariance = lost * robust * half @ middle @ half.T / unit / unit[:, None]
@@ -144,9 +146,13 @@ def information(descent: Descent) -> Information:
     return Information(covariance, null, confirmed, effective, correlation, white, float(lost))
 
 
-def null_space(triangles: np.ndarray, states: int, unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray]:
-    """Directions of u (F, K) that nothing depends on, the starts being free; and a basis (F, F − K) of the others."""
+def null_space(
+    triangles: np.ndarray, states: int, unknowns: Unknowns, prior: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Directions of u (F, K) that nothing depends on, the starts being free, and on which no prior of weights (F,) has
+    an opinion; and a basis (F, F − K) of the others."""
     rows, unit = parameter_rows(triangles, states, unknowns), _lengths(triangles, states, unknowns)
+    rows = np.concatenate([rows, np.diag(prior)])
     if not len(unit):
         return np.zeros((0, 0)), np.zeros((0, 0))
     # From above zero by its own round-off, so that a column which is noise alone counts as nothing.
@@ -162,7 +168,8 @@ def confirmed_null(residuals: Residuals, point: Trial, null: np.ndarray) -> np.n
         return null
     with np.errstate(divide="ignore"):
         level = [np.where(size > 0, 1.0 / size, 0.0) for size in sizes]
-    return null_space(residuals.triangles(point, level), residuals.states, residuals.unknowns)[0]
+    prior = residuals.parameters.prior_weights
+    return null_space(residuals.triangles(point, level), residuals.states, residuals.unknowns, prior)[0]
 
 
 def row_sizes(residuals: Residuals, point: Trial) -> list[np.ndarray]:

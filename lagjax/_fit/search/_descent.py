@@ -70,6 +70,11 @@ class Anchor(NamedTuple):
     def pull(self, u: np.ndarray) -> np.ndarray:
         return self.weight * (u - self.centre)
 
+    def add_prior(self, weight: np.ndarray) -> "Anchor":
+        """The same with the sum of a prior density about zero, Σ (weight · u)²/2, but for a constant."""
+        both = np.hypot(self.weight, weight)
+        return Anchor(self.centre * (self.weight / np.where(both > 0, both, 1.0)) ** 2, both)
+
 
 class _Model:
     """The least squares about one trial, with the noise and the weights of its samples; `cost` is half their sum."""
@@ -113,6 +118,7 @@ def minimise(
     """
     trial = residuals.evaluate(point)
     anchor = Anchor(point.u, np.zeros_like(point.u)) if anchor is None else anchor
+    anchor = anchor.add_prior(residuals.parameters.prior_weights)
     damping, trials, falls = _FIRST, 1, [(1, np.inf)]
     while True:
         model = _Model(residuals, trial, law, anchor)

@@ -1,0 +1,143 @@
+"""Evidence: how smooth a learned function is, from the recordings.
+
+The numbers of a learned function have the prior density exp(−λ Σ u²/2) over the m of its unknowns u that are rough. The
+evidence of λ is the integral of the likelihood times this density. About the fit the motion is linear in u, with H the
+square of its weighted derivatives, so that the integral is known, and is largest where
+
+    λ = γ / Σ u²      γ = Σ (1 − λ C_kk)      C = (H + λ)⁻¹
+
+γ is the number of unknowns that the recordings determine. The fixed point is found in the linear model, then the
+motion is fitted anew, and so forth, until λ stays.
+
+Source: MacKay, Neural Computation 4 (1992) 415, eqs. 4.6 to 4.9.
+"""
+
+import contextlib
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._fit.model._noise import AbstractNoise, NoiseScale
+from lagjax._fit.model._parameters import Parameters
+from lagjax._fit.model._residuals import LostMotion, Point, Residuals, Trial
+from lagjax._fit.model._transforms import Smooth
+from lagjax._fit.result._information import parameter_rows
+from lagjax._fit.search._descent import Descent, minimise
+
+_ENOUGH, _TRIALS = 1e-3, 60  # of each search, as of the first
+_ROUNDS = 12  # of fits, most of which take two trials
+_SAME = 0.1  # |log λ| between two fits: intervals differ by a hundredth
+_INNER, _INNER_SAME = 200, 1e-3  # rounds in the linear model
+# λ over what data say of an unknown: a function that data determine at every knot, and one that is a straight line.
+_WEAKEST, _STRONGEST = 1e-15, 1e12
+_FIRST = 1e-9  # of what data say: less than they do but where they say nothing
+_SEEN = 0.5  # of the prior variance of a second difference: where the posterior variance is less, data were seen
+
+
+class SmoothPart(NamedTuple):
+    """The leaf of a learned function: its label, its transform, and its rough unknowns among the F."""
+
+    label: str
+    transform: Smooth
+    rough: np.ndarray
+    own: slice
+
+
+def begin_weakly(residuals: Residuals, point: Point, law: AbstractNoise) -> Residuals:
+    """The residuals with priors that are weak beside what data say at a point, in any units; unchanged without priors
+    and where no motion can be followed."""
+    if not smooth_parts(residuals.parameters):
+        return residuals
+    with contextlib.suppress(LostMotion):
+        trial = residuals.evaluate(point)
+        square = _data_square(residuals, trial, residuals.noise_scale(trial, law))
+        parts = smooth_parts(residuals.parameters)
+        strengths = {part.label: _FIRST * _mean_information(square, part) for part in parts}
+        return residuals.with_parameters(residuals.parameters.with_strengths(strengths))
+    return residuals
+
+
+def find_smoothness(done: Descent, law: AbstractNoise, tell: Callable[[str], None] | None) -> Descent:
+    """The fit with the strengths of priors that evidence asks for, from one with any; unchanged without priors."""
+    if not smooth_parts(done.residuals.parameters):
+        return done
+    trials = done.trials
+    for _ in range(_ROUNDS):
+        parts = smooth_parts(done.residuals.parameters)
+        strengths = _strengths(done, parts)
+        moved = max(abs(np.log(strengths[part.label] / part.transform.strength)) for part in parts)
+        residuals = done.residuals.with_parameters(done.residuals.parameters.with_strengths(strengths))
+        again = minimise(residuals, done.trial.point, law, _ENOUGH, _TRIALS)
+        trials += again.trials
+        done = again._replace(converged=done.converged and again.converged, message=done.message)
+        if tell is not None:
+            tell(", ".join(f"{name}: strength {value:.3g}" for name, value in strengths.items()))
+        if moved < _SAME:
+            break
+    said = [_sentence(done, part) for part in smooth_parts(done.residuals.parameters)]
+    return done._replace(trials=trials, message=" ".join([done.message, *said]))
+
+
+def smooth_parts(parameters: Parameters) -> list[SmoothPart]:
+    """The leaves of learned functions among the free parameters."""
+    return [
+        SmoothPart(part.label, part.transform, own.start + np.flatnonzero(part.transform.rough), own)
+        for own, _, part in parameters.cuts
+        if isinstance(part.transform, Smooth)
+    ]
+
+
+def _strengths(done: Descent, parts: list[SmoothPart]) -> dict[str, float]:
+    """λ of each learned function, by label: the fixed point in the model that is linear about a fit."""
+    square, prior = _data_square(done.residuals, done.trial, done.noise), done.residuals.parameters.prior_weights
+    target = square @ done.trial.u + prior**2 * done.trial.u
+    precision, found = prior**2, {part.label: part.transform.strength for part in parts}
+    for _ in range(_INNER):
+        covariance = np.linalg.inv(square + np.diag(precision) + _floor(square))
+        u, moved = covariance @ target, 0.0
+        for part in parts:
+            before, own = found[part.label], u[part.rough]
+            determined = max(len(own) - before * float(np.diag(covariance)[part.rough].sum()), 1e-6)
+            ends = np.array([_WEAKEST, _STRONGEST]) * _mean_information(square, part)
+            value = float(np.clip(determined / max(float(own @ own), np.finfo(float).tiny), *ends))
+            moved = max(moved, abs(np.log(value / before)))
+            found[part.label] = value
+            precision[part.rough] = value
+        if moved < _INNER_SAME:
+            break
+    return found
+
+
+def _floor(square: np.ndarray) -> np.ndarray:
+    """A diagonal that changes nothing but what nothing depends on, of which the inverse would not exist."""
+    return 1e-14 * np.diag(np.maximum(np.diag(square), 1e-14))
+
+
+def _mean_information(square: np.ndarray, part: SmoothPart) -> float:
+    """The mean information about a rough unknown of a learned function; one where there is none."""
+    mean = float(np.diag(square)[part.rough].mean())
+    return mean if mean > 0.0 else 1.0
+
+
+def _data_square(residuals: Residuals, trial: Trial, noise: NoiseScale) -> np.ndarray:
+    """H (F, F), what the data say about the unknowns, the starts being free."""
+    triangles = residuals.triangles(trial, residuals.fisher_factors(trial, noise))
+    rows = parameter_rows(triangles, residuals.states, residuals.unknowns)
+    return rows.T @ rows
+
+
+def _sentence(done: Descent, part: SmoothPart) -> str:
+    """A sentence: how many numbers of a learned function the data determine, and between which places they show it."""
+    square, prior = _data_square(done.residuals, done.trial, done.noise), done.residuals.parameters.prior_weights
+    covariance = np.linalg.inv(square + np.diag(prior**2) + _floor(square))
+    determined = len(part.rough) - part.transform.strength * np.diag(covariance)[part.rough].sum()
+    text = f"Data determine {determined:.1f} numbers of the shape of {part.label}"
+    bends = np.diff(part.transform.basis, n=2, axis=0)
+    before = np.sum((bends * part.transform.rough) ** 2, axis=1) / part.transform.strength
+    after = np.einsum("kf,fg,kg->k", bends, covariance[part.own, part.own], bends)
+    seen = 1 + np.flatnonzero(after < _SEEN * before)
+    if not seen.size or (knots := part.transform.knots) is None:
+        return f"{text}."
+    where = f"seen from {knots[seen[0]]:.3g} to {knots[seen[-1]]:.3g}"
+    return f"{text}, which was {where}; beyond, its interval is its prior's."
