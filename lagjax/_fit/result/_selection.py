@@ -158,6 +158,7 @@ class _TermFit(NamedTuple):
     zero: np.ndarray
     known: Information
     rows: np.ndarray
+    log_likelihood: float
 
     @classmethod
     def from_descent(cls, done: Descent, names: dict[str, str]) -> "_TermFit":
@@ -174,11 +175,7 @@ class _TermFit(NamedTuple):
         whole = parameter_rows(triangles, residuals.states, residuals.unknowns)
         rows = np.zeros((len(own), len(parameters)))
         rows[:, own] = qr_triangle(whole[:, [*others, *own]])[len(others) :, len(others) :]
-        return cls(done, columns, zero, information(done), rows)
-
-    @property
-    def log_likelihood(self) -> float:
-        return self.done.residuals.log_likelihood(self.done.trial, self.done.noise)
+        return cls(done, columns, zero, information(done), rows, residuals.log_likelihood(done.trial, done.noise))
 
     def places(self, names) -> np.ndarray:
         """The unknowns of some terms."""

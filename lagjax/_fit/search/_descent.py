@@ -83,7 +83,10 @@ class _Model:
         self.residuals, self.trial, self.anchor = residuals, trial, anchor
         self.noise = residuals.noise_scale(trial, law)
         self.factors = residuals.factors(trial, self.noise)
-        self.triangles = residuals.linearise(trial, self.noise)
+        self.triangles, self.unknowns = residuals.linearise(trial, self.noise), residuals.unknowns
+        if not self.unknowns.own and not self.triangles[..., : residuals.states].any():  # nothing is a piece's own
+            self.triangles = compress_rows(self.triangles.reshape(1, -1, self.triangles.shape[-1]))
+            self.unknowns = self.unknowns.select([0])
         self.cost = self.cost_of(trial)
 
     def cost_of(self, trial: Trial) -> float:
@@ -91,7 +94,7 @@ class _Model:
         return self.residuals.cost(trial, self.factors, self.noise) + pulled
 
     def step(self, damping: float) -> DescentStep:
-        u, states, unknowns = self.trial.u, self.residuals.states, self.residuals.unknowns
+        u, states, unknowns = self.trial.u, self.residuals.states, self.unknowns
         pull, limits = (self.anchor.weight, self.anchor.pull(u)), self.residuals.parameters.limits(u)
         scale = column_norms(self.triangles, states, unknowns)
         return eliminate(self.triangles, states, scale, damping, pull, unknowns, limits)
