@@ -7,8 +7,8 @@ square of its weighted derivatives, so that the integral is known, and is larges
     λ = γ / Σ u²      γ = Σ (1 − λ C_kk)      C = (H + λ)⁻¹
 
 γ is the number of unknowns that the recordings determine. Where residuals are correlated the data tell a share of H,
-and a search, which counts every sample, has the strength λ over that share. The fixed point is found in the linear model, then the
-motion is fitted anew, and so forth, until λ stays.
+and a search, which counts every sample, has the strength λ over that share. The fixed point is found in the linear
+model, then the motion is fitted anew, and so forth, until λ stays.
 
 Source: MacKay, Neural Computation 4 (1992) 415, eqs. 4.6 to 4.9.
 """
