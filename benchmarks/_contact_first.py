@@ -24,7 +24,7 @@ import numpy as np
 
 import lagjax
 from benchmarks._contacts import spinning_ball, system_of
-from examples.cube import LAWS, cube_scene, toss
+from examples.cube import PUBLISHED, cube_scene, own_toss
 
 LIMIT = 120  # CPU s of a row
 G, E, LID, SPAN = 9.81, 0.7, 1.7, 2.0
@@ -187,8 +187,8 @@ def _chain(count: int) -> tuple:
 
 def _cube(rough: bool, slopes: bool = False) -> tuple:
     """The toss of the example: the cube comes to rest on a face; slopes at 0.2 s, behind its first impacts."""
-    scene, start = cube_scene(rough), toss()
-    laws = LAWS if rough else {"restitution": LAWS["restitution"]}
+    scene, start = cube_scene(rough), own_toss()
+    laws = {name: value for name, value in PUBLISHED.items() if rough or name != "friction"}
     ts = np.linspace(0.0, 0.2 if slopes else 1.2, 46)
 
     def place(laws, start):

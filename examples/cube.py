@@ -62,12 +62,13 @@ def gaps(q, params):
     return places[:, 2] - params["height"] - places[:, :2] @ params["tilt"]
 
 
-def cube_scene():
-    """The cube and its board."""
+def cube_scene(rough=True):
+    """The cube and its board, with friction or without."""
+    friction = {"friction": lambda params: params["friction"], "slip": sliding} if rough else {}
     return lagjax.System(
         lambda q, v: 0.5 * v["place"] @ v["place"] + 2 * INERTIA * v["turn"] @ v["turn"] - G * q["place"][2],
-        constraints=lambda q: q["turn"] @ q["turn"] - 1.0, contacts=gaps, slip=sliding,
-        restitution=lambda params: params["restitution"], friction=lambda params: params["friction"],
+        constraints=lambda q: q["turn"] @ q["turn"] - 1.0, contacts=gaps,
+        restitution=lambda params: params["restitution"], **friction,
     )  # fmt: skip
 
 

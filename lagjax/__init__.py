@@ -38,7 +38,7 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 **Parameters from recordings**
 
 - `fit`: the likeliest parameters with intervals, as a `Fit`; its methods return a `Profile`, a `Prediction`,
-  `Experiments`, a `Comparison`
+  `Experiments`, a `Comparison`, and it holds the `Selection` of candidate terms
 - `Record`, `Timings`, `Guess`, `Delayed`, `wrapped`: what was measured, and how
 - `Gaussian`, `StudentT`, `Quantised`, `Clipped`: the noise
 - `positive`, `between`, `angle`, `simplex`, `inertia`: what parameters may be; `per_record`: one value a record
