@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._fit.model._law_parameters import find_laws, plain_dicts
-from lagjax._fit.model._transforms import AbstractTransform, Unbounded
+from lagjax._fit.model._transforms import AbstractTransform, Smooth, Unbounded
 from lagjax._interface import as_arrays, labelled_leaves, require_finite
 
 PyTree = Any
@@ -241,12 +241,12 @@ class Parameters:
 
     def with_strengths(self, strengths: dict[str, float]) -> "Parameters":
         """The same with other strengths of the priors of learned functions, by the labels of their leaves."""
-        parts = tuple(
-            part._replace(transform=replace(part.transform, strength=strengths[part.label]))
-            if part.label in strengths else part
-            for part in self.parts
-        )  # fmt: skip
-        return replace(self, parts=parts)
+        parts = []
+        for part in self.parts:
+            if isinstance(part.transform, Smooth):
+                part = part._replace(transform=replace(part.transform, strength=strengths[part.label]))
+            parts.append(part)
+        return replace(self, parts=tuple(parts))
 
     def draw(self, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Another place (F,) to begin a search from; the numbers of one record, like its start, follow the others."""

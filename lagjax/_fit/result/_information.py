@@ -100,10 +100,7 @@ def information(descent: Descent) -> Information:
     null, basis = null_space(triangles, residuals.states, unknowns, prior)
     # Growth alone is not enough: a drive that sets in smoothly begins with rows as small as numbers can be.
     free, states = len(trial.u), residuals.states
-    sizes = np.append(residuals.parameters.sizes(trial.u), 0.0)[unknowns.columns][:, None, None]
-    pairs = zip(residuals.batches, trial.slopes, strict=True)
-    last = [np.abs(x[..., states:] * sizes[b.rows] / residuals.size[:, None]).max(initial=0.0) for b, x in pairs]
-    if max(last) > _LOST and growth(row_sizes(residuals, trial)) > _LOST:
+    if _largest_slope(residuals, trial) > _LOST and growth(row_sizes(residuals, trial)) > _LOST:
         null, basis = np.eye(free), np.zeros((free, 0))
     laws = autocorrelations(residuals, trial, noise)
     effective, correlation = (np.array(x) for x in zip(*((a.count / a.time, a.neighbour) for a in laws), strict=True))
@@ -145,6 +142,14 @@ def information(descent: Descent) -> Information:
     covariance[unseen, unseen] = np.inf
     confirmed = null if not null.size else confirmed_null(residuals, trial, null)
     return Information(covariance, null, confirmed, effective, correlation, white, float(lost))
+
+
+def _largest_slope(residuals: Residuals, trial: Trial) -> float:
+    """The largest derivative of a signal, as a fraction of its size, by an unknown, as a fraction of its own."""
+    sizes = np.append(residuals.parameters.sizes(trial.u), 0.0)[residuals.unknowns.columns][:, None, None]
+    pairs = zip(residuals.batches, trial.slopes, strict=True)
+    units = residuals.size[:, None]
+    return max(np.abs(x[..., residuals.states :] * sizes[b.rows] / units).max(initial=0.0) for b, x in pairs)
 
 
 def null_space(
