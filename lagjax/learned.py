@@ -31,7 +31,7 @@ _INNER = np.array([[1.0, -3.0, 3.0, -1.0], [4.0, 0.0, -6.0, 3.0], [1.0, 3.0, 3.0
 
 
 @dataclass(frozen=True)
-class _Axis:
+class _SplineAxis:
     """One argument of a spline: evenly spaced knots from `low` to `high`, of which a periodic one has no last.
 
     Of a size, |v|, that begins at `low` no argument lies before the range: its first knot is no border of machine code.
@@ -115,7 +115,7 @@ class FreeFunction(AbstractLaw):
     """
 
     kind: str
-    axes: tuple[_Axis, ...]
+    axes: tuple[_SplineAxis, ...]
     shape_value: Callable
     gauge: bool = False
 
@@ -315,7 +315,7 @@ def dissipation(range: Any, count: Any = 20, *, dry: bool = True, odd: bool = Tr
     return FreeFunction("dissipation", axes, force)
 
 
-def _read_axes(ranges: Any, count: Any, periodic: Any) -> tuple[_Axis, ...]:
+def _read_axes(ranges: Any, count: Any, periodic: Any) -> tuple[_SplineAxis, ...]:
     pairs = np.asarray(ranges, float)
     pairs = pairs[None] if pairs.ndim == 1 else pairs
     if pairs.ndim != 2 or pairs.shape[1] != 2 or not 1 <= len(pairs) <= _MOST_ARGUMENTS:
@@ -329,5 +329,5 @@ def _read_axes(ranges: Any, count: Any, periodic: Any) -> tuple[_Axis, ...]:
             raise ValueError(f"range must increase, between finite ends; got ({low:g}, {high:g}).")
         if not isinstance(n, int | np.integer) or n < _FEWEST_KNOTS:
             raise ValueError(f"count must be a whole number, {_FEWEST_KNOTS} or larger; got {n!r}.")
-        axes.append(_Axis(low, high, int(n), bool(is_periodic)))
+        axes.append(_SplineAxis(low, high, int(n), bool(is_periodic)))
     return tuple(axes)

@@ -147,8 +147,11 @@ def fit(
     if hold not in HOLDS:
         raise ValueError(f"hold must be one of {', '.join(map(repr, HOLDS))}; got {hold!r}.")
     require_untraced(params0, "params0")
-    if method == "gradient" and any(law.law.selects for law in find_laws(params0)):
-        raise ValueError('method="gradient" chooses no terms: leave it, or fit all terms, dict(law.params0).')
+    if method == "gradient" and find_laws(params0):
+        raise ValueError(
+            'method="gradient" chooses no terms, and no smoothness of learned functions: leave it, or fit all of their '
+            "numbers, dict(law.params0)."
+        )
     noise = Gaussian() if noise is None else noise
     if not isinstance(noise, AbstractNoise):
         raise TypeError(f"noise must be lagjax.Gaussian(), StudentT(), Quantised(…) or Clipped(…); got {noise!r}.")

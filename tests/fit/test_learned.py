@@ -159,6 +159,7 @@ def test_other_units_change_no_digit(mass):
         (lambda: dissipation((-1.0, 1.0)), "not negative"),
         (lambda: WELL(0.0, params={"spline": np.zeros(3)}), "shape"),
         (lambda: lagjax.fit(well, STILL, WELL.params0, transforms=lagjax.positive), "transform"),
+        (lambda: lagjax.fit(well, STILL, WELL.params0, method="gradient"), "no smoothness"),
     ],
 )  # fmt: skip
 def test_a_mistake_is_a_sentence(make, words):

@@ -239,7 +239,7 @@ class Parameters:
         each = (part.transform.prior_weights(rows.stop - rows.start) for _, rows, part in self.cuts)
         return np.concatenate([np.zeros(0), *each])
 
-    def with_strengths(self, strengths: dict[str, float]) -> "Parameters":
+    def replace_strengths(self, strengths: dict[str, float]) -> "Parameters":
         """The same with other strengths of the priors of learned functions, by the labels of their leaves."""
         parts = []
         for part in self.parts:

@@ -57,7 +57,7 @@ def begin_weakly(residuals: Residuals, point: Point, law: AbstractNoise) -> Resi
         square = _data_square(residuals, trial, residuals.noise_scale(trial, law))
         parts = smooth_parts(residuals.parameters)
         strengths = {part.label: _FIRST * _mean_information(square, part) for part in parts}
-        return residuals.with_parameters(residuals.parameters.with_strengths(strengths))
+        return residuals.with_parameters(residuals.parameters.replace_strengths(strengths))
     return residuals
 
 
@@ -72,7 +72,7 @@ def find_smoothness(done: Descent, law: AbstractNoise, tell: Callable[[str], Non
         moved = max(abs(np.log(wanted[name] / before[name])) for name in before)
         # The first strength is any. Then half a step: correlation of residuals depends on what a prior leaves.
         strengths = wanted if k == 0 else {name: math.sqrt(before[name] * wanted[name]) for name in before}
-        residuals = done.residuals.with_parameters(done.residuals.parameters.with_strengths(strengths))
+        residuals = done.residuals.with_parameters(done.residuals.parameters.replace_strengths(strengths))
         again = minimise(residuals, done.trial.point, law, _ENOUGH, _TRIALS)
         trials += again.trials
         done = again._replace(converged=done.converged and again.converged, message=done.message)
@@ -81,9 +81,11 @@ def find_smoothness(done: Descent, law: AbstractNoise, tell: Callable[[str], Non
         if moved < _SAME:
             text = ""
             break
-    done = done._replace(converged=done.converged and not text)
-    said = [text] * bool(text) + [_sentence(done, part) for part in smooth_parts(done.residuals.parameters)]
-    return done._replace(trials=trials, message=" ".join([done.message, *said]))
+    square = _data_square(done.residuals, done.trial, done.noise)
+    covariance = _covariance(square, done.residuals.parameters.prior_weights**2)
+    said = [text] * bool(text) + [_sentence(covariance, part) for part in smooth_parts(done.residuals.parameters)]
+    message = " ".join([done.message, *said])
+    return done._replace(converged=done.converged and not text, trials=trials, message=message)
 
 
 def smooth_parts(parameters: Parameters) -> list[SmoothPart]:
@@ -102,7 +104,7 @@ def _strengths(done: Descent, parts: list[SmoothPart]) -> dict[str, float]:
     share = independent_share(done.residuals, done.trial, done.noise)
     precision, found = prior**2, {part.label: part.transform.strength for part in parts}
     for _ in range(_INNER):
-        covariance = np.linalg.inv(square + np.diag(precision) + _floor(square))
+        covariance = _covariance(square, precision)
         u, moved = covariance @ target, 0.0
         for part in parts:
             before, own = found[part.label], u[part.rough]
@@ -117,9 +119,11 @@ def _strengths(done: Descent, parts: list[SmoothPart]) -> dict[str, float]:
     return found
 
 
-def _floor(square: np.ndarray) -> np.ndarray:
-    """A diagonal that changes nothing but what nothing depends on, of which the inverse would not exist."""
-    return 1e-14 * np.diag(np.maximum(np.diag(square), 1e-14))
+def _covariance(square: np.ndarray, precision: np.ndarray) -> np.ndarray:
+    """C (F, F) of the unknowns, from what the data and what the priors (F,) say; with a trace of one where neither
+    says anything, of which there would be no inverse."""
+    trace = 1e-14 * np.maximum(np.diag(square), 1e-14)
+    return np.linalg.inv(square + np.diag(precision + trace))
 
 
 def _mean_information(square: np.ndarray, part: SmoothPart) -> float:
@@ -135,10 +139,8 @@ def _data_square(residuals: Residuals, trial: Trial, noise: NoiseScale) -> np.nd
     return rows.T @ rows
 
 
-def _sentence(done: Descent, part: SmoothPart) -> str:
+def _sentence(covariance: np.ndarray, part: SmoothPart) -> str:
     """A sentence: how many numbers of a learned function the data determine, and between which places they show it."""
-    square, prior = _data_square(done.residuals, done.trial, done.noise), done.residuals.parameters.prior_weights
-    covariance = np.linalg.inv(square + np.diag(prior**2) + _floor(square))
     determined = len(part.rough) - part.transform.strength * np.diag(covariance)[part.rough].sum()
     text = f"Data determine {determined:.1f} numbers of the shape of {part.label}"
     bends = np.diff(part.transform.basis, n=2, axis=0)
