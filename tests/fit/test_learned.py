@@ -135,7 +135,7 @@ def test_a_rougher_function_has_a_weaker_prior():
     assert found[0] < found[1] - 0.5
 
 
-@pytest.mark.parametrize("mass", [1e-9, pytest.param(1e9, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mass", [1e-9, pytest.param(1e24, marks=pytest.mark.slow)])
 def test_other_units_change_no_digit(mass):
     """A potential in other units of energy, with a mass in other units, has the same motion and the same evidence."""
 

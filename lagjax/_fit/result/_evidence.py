@@ -65,20 +65,21 @@ def find_smoothness(done: Descent, law: AbstractNoise, tell: Callable[[str], Non
     """The fit with the strengths of priors that evidence asks for, from one with any; unchanged without priors."""
     if not smooth_parts(done.residuals.parameters):
         return done
-    trials, text = done.trials, "The smoothness did not settle."
-    for k in range(_ROUNDS):
+    trials, text, last, pace = done.trials, "The smoothness did not settle.", {}, 1.0
+    for _ in range(_ROUNDS):
         parts = smooth_parts(done.residuals.parameters)
         before, wanted = {part.label: part.transform.strength for part in parts}, _strengths(done, parts)
-        moved = max(abs(np.log(wanted[name] / before[name])) for name in before)
-        # The first strength is any. Then half a step: correlation of residuals depends on what a prior leaves.
-        strengths = wanted if k == 0 else {name: math.sqrt(before[name] * wanted[name]) for name in before}
+        moves = {name: math.log(wanted[name] / before[name]) for name in before}
+        # Correlation of residuals depends on what a prior leaves, and strengths may go back and forth.
+        pace *= 0.5 if any(moves[name] * last.get(name, 0.0) < 0.0 for name in moves) else 1.0
+        strengths, last = {name: before[name] * math.exp(pace * moves[name]) for name in before}, moves
         residuals = done.residuals.with_parameters(done.residuals.parameters.replace_strengths(strengths))
         again = minimise(residuals, done.trial.point, law, _ENOUGH, _TRIALS)
         trials += again.trials
         done = again._replace(converged=done.converged and again.converged, message=done.message)
         if tell is not None:
             tell(", ".join(f"{name}: strength {value:.3g}" for name, value in strengths.items()))
-        if moved < _SAME:
+        if max(map(abs, moves.values())) < _SAME:
             text = ""
             break
     square = _data_square(done.residuals, done.trial, done.noise)
@@ -122,7 +123,8 @@ def _strengths(done: Descent, parts: list[SmoothPart]) -> dict[str, float]:
 def _covariance(square: np.ndarray, precision: np.ndarray) -> np.ndarray:
     """C (F, F) of the unknowns, from what the data and what the priors (F,) say; with a trace of one where neither
     says anything, of which there would be no inverse."""
-    trace = 1e-14 * np.maximum(np.diag(square), 1e-14)
+    said = np.diag(square)
+    trace = 1e-14 * np.where(said > 0.0, said, 1.0)
     return np.linalg.inv(square + np.diag(precision + trace))
 
 
