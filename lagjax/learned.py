@@ -316,7 +316,10 @@ def dissipation(range: Any, count: Any = 20, *, dry: bool = True, odd: bool = Tr
 
 
 def _read_axes(ranges: Any, count: Any, periodic: Any) -> tuple[_SplineAxis, ...]:
-    pairs = np.asarray(ranges, float)
+    try:
+        pairs = np.asarray(ranges, float)
+    except (TypeError, ValueError):
+        pairs = np.zeros(0)
     pairs = pairs[None] if pairs.ndim == 1 else pairs
     if pairs.ndim != 2 or pairs.shape[1] != 2 or not 1 <= len(pairs) <= _MOST_ARGUMENTS:
         raise ValueError(f"range must be (low, high), or one to three of them; got {ranges!r}.")

@@ -155,6 +155,7 @@ def test_other_units_change_no_digit(mass):
     ("make", "words"),
     [
         (lambda: potential((1.0, 0.0)), "must increase"),
+        (lambda: potential("wide"), "one to three"),
         (lambda: potential((0.0, 1.0), count=3), "4 or larger"),
         (lambda: dissipation((-1.0, 1.0)), "not negative"),
         (lambda: WELL(0.0, params={"spline": np.zeros(3)}), "shape"),

@@ -12,6 +12,7 @@ import numpy as np
 from lagjax._engine import DEFAULT_RTOL
 from lagjax._equations import has_constraints
 from lagjax._fit.model._inputs import InputForm, input_functions
+from lagjax._fit.model._law_parameters import plain_dicts
 from lagjax._fit.model._motions import Manifold, choose_motions
 from lagjax._fit.model._noise import AbstractNoise, Sensor, StudentT, read_sensor
 from lagjax._fit.model._parameters import Parameters
@@ -139,7 +140,7 @@ def _read_layout(system: Scene, records: list[Record], params0, form: InputForm 
     except Exception as reason:
         said = f"({type(reason).__name__}: {str(reason).splitlines()[0]})"
         if where := find_params_expression(reason):
-            text = f"ask for `{where}`, which params0 does not have {said}: params0 is {jax.tree.structure(params0)}."
+            text = f"ask for `{where}`, which params0 does not have {said}: params0 is {jax.tree.structure(plain_dicts(params0))}."
         elif place is not None:
             text = f"cannot be called with the start of records[{place}] {said}: give it in the structure of q."
         else:
