@@ -11,6 +11,7 @@ everywhere. How smooth S is, the recordings decide: a prior density proportional
 and `fit` finds λ by evidence.
 """
 
+import contextlib
 import functools
 import math
 from collections.abc import Callable, Mapping
@@ -316,11 +317,9 @@ def dissipation(range: Any, count: Any = 20, *, dry: bool = True, odd: bool = Tr
 
 
 def _read_axes(ranges: Any, count: Any, periodic: Any) -> tuple[_SplineAxis, ...]:
-    try:
-        pairs = np.asarray(ranges, float)
-    except (TypeError, ValueError):
-        pairs = np.zeros(0)
-    pairs = pairs[None] if pairs.ndim == 1 else pairs
+    pairs: Any = np.zeros(0)
+    with contextlib.suppress(TypeError, ValueError):  # what is no numbers is refused below
+        pairs = np.atleast_2d(np.asarray(ranges, float))
     if pairs.ndim != 2 or pairs.shape[1] != 2 or not 1 <= len(pairs) <= _MOST_ARGUMENTS:
         raise ValueError(f"range must be (low, high), or one to three of them; got {ranges!r}.")
     counts, around = ([x] * len(pairs) if np.ndim(x) == 0 else list(x) for x in (count, periodic))

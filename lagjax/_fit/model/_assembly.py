@@ -140,7 +140,8 @@ def _read_layout(system: Scene, records: list[Record], params0, form: InputForm 
     except Exception as reason:
         said = f"({type(reason).__name__}: {str(reason).splitlines()[0]})"
         if where := find_params_expression(reason):
-            text = f"ask for `{where}`, which params0 does not have {said}: params0 is {jax.tree.structure(plain_dicts(params0))}."
+            given = jax.tree.structure(plain_dicts(params0))
+            text = f"ask for `{where}`, which params0 does not have {said}: params0 is {given}."
         elif place is not None:
             text = f"cannot be called with the start of records[{place}] {said}: give it in the structure of q."
         else:
