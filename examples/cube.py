@@ -16,7 +16,7 @@ flight on its first four samples, and compared with its record after 0.3 s.
   numbers, and a paraboloid through the logarithms of their errors has its least there. Its interval is that of draws
   of ten tosses among the ten (the bootstrap).
 
-    python examples/cube.py [tosses.npz] [--follow OTHER.npz] [--tosses 10]
+    python examples/cube.py tosses.npz [--follow OTHER.npz]
 """
 
 import argparse
