@@ -209,14 +209,9 @@ class Parameters:
 
     def directions(self, u: np.ndarray) -> np.ndarray:
         """The derivatives of the numbers of every record by the unknowns that these depend on, (R, L, P)."""
-        found, (*places, which) = (
-            np.zeros((*self.unknowns.columns.shape, self.places.shape[1])),
-            self._derivative_places,
-        )
-        if self.unknowns.own:
-            found[tuple(places)] = self._slopes(u)[2][which]
-        else:
-            found[:, places[1], places[2]] = self._slopes(u)[2][which]
+        found = np.zeros((*self.unknowns.columns.shape, self.places.shape[1]))
+        record, column, number, which = self._derivative_places
+        found[record if self.unknowns.own else slice(None), column, number] = self._slopes(u)[2][which]
         return found
 
     def ends(self, u: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -591,9 +591,9 @@ def qr_triangle(rows: np.ndarray) -> np.ndarray:
 
 
 _BLOCK = 8  # times as many rows as columns in one factorisation, and twice as many at least
-# Numbers in one factorisation, up to which OpenBLAS takes one thread for a product of matrix and vector (9216). Of twice
-# as many two threads wait for each other: 64 columns then take 50 times as long on a busy machine.
-_LARGEST_BLOCK = 8192
+# Numbers in one factorisation, for which OpenBLAS takes one thread (up to 9216). Of twice as many, of 64 columns, its
+# threads wait for each other: 50 times the processor time on a busy machine.
+_BLOCK_NUMBERS = 8192
 
 
 def compress_rows(rows: np.ndarray) -> np.ndarray:
@@ -602,7 +602,7 @@ def compress_rows(rows: np.ndarray) -> np.ndarray:
     pieces, _, columns = rows.shape
     rows = rows if columns else rows[:, :0]
     while rows.shape[1] > columns:
-        height = max(2 * columns, min(_BLOCK * columns, _LARGEST_BLOCK // columns))
+        height = max(2 * columns, min(_BLOCK * columns, _BLOCK_NUMBERS // columns))
         height = min(height, rows.shape[1])
         if missing := -rows.shape[1] % height:
             rows = np.concatenate([rows, np.zeros((pieces, missing, columns))], axis=1)

@@ -23,8 +23,8 @@ import numpy as np
 
 from lagjax._equations import decide
 from lagjax._fit.model._noise import AbstractNoise
-from lagjax._fit.model._records import Record
 from lagjax._fit.model._parameters import stack_rows
+from lagjax._fit.model._records import Record
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals, Trial, compress_rows
 from lagjax._fit.model._sensor_faults import TOO_COARSE, constant_signals, describe_sensors
 from lagjax._fit.model._transforms import Between, Positive
@@ -238,7 +238,8 @@ def _shift_clause(label: str, shift: float) -> str:
 
 class Shifts(NamedTuple):
     """The fits without one of the `records` (R,): how far each u moves, `sizes` (R, F), in standard deviations for
-    records that agree, and by how much parameters of its own would lower a record's sum of squares, `explained` (R,)."""
+    records that agree; by how much parameters of its own would lower the sum of squares of a record, `explained` (R,).
+    """
 
     records: np.ndarray
     sizes: np.ndarray

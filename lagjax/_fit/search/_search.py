@@ -45,7 +45,7 @@ _LOST = 2  # levels that may be lost: after one the next may find the motion aga
 _LYAPUNOV = 5.0  # times 1/λ that a record is long: shorter ones are followed whole
 # Records of a sample that is searched before all of them, the samples that it has for each unknown, and times as many
 # records from which on it pays.
-_FEWEST_SAMPLED, _SAMPLES_EACH, _MANY = 64, 30, 4
+_SAMPLED, _SAMPLES_EACH, _PAYS = 64, 30, 4
 _SUSPECT, _SAMPLES_OF_LEVEL = 0.05, 4  # of the signals, left by a search; samples for each unknown in first samples
 _GRADIENT_STEPS = 3000  # of a descent by gradients
 
@@ -99,9 +99,9 @@ class Search:
         """The places of all pieces, or of an even sample of them where a part says enough about the parameters."""
         residuals = self.residuals
         followed = residuals.unknowns.columns.shape[1] + residuals.states * residuals.fitted.any()
-        count = max(_FEWEST_SAMPLED, round(_SAMPLES_EACH * followed * len(residuals.pieces) / residuals.measured))
+        count = max(_SAMPLED, round(_SAMPLES_EACH * followed * len(residuals.pieces) / residuals.measured))
         every = len(residuals.pieces)
-        return even_places(every, count if _MANY * count <= every else every)
+        return even_places(every, count if _PAYS * count <= every else every)
 
     def _minimise_sample(self, point: Point, places: np.ndarray, length: int | None) -> Point:
         """The point with what the search of the pieces at `places`, up to a number of samples of each, comes to."""
