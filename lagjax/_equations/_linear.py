@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from lagjax._primitives import start_alike
+from lagjax._primitives import vary_carry_alike
 
 # The numbers of one state, as arrays of JAX or NumPy, and those of S states, as arrays of NumPy.
 Matrix = Float[Array, "n n"]
@@ -146,7 +146,7 @@ def invert(matrix: Matrix) -> tuple[Matrix, Int[Array, " n"], Vector]:
         order = jax.lax.dynamic_update_slice_in_dim(order, panel_order, index * width, 0)
         return panel, left, order, jax.lax.dynamic_update_slice_in_dim(pivots, panel_pivots, index * width, 0)
 
-    start = start_alike((a, jnp.ones(size, bool), jnp.zeros(size, np.int32), jnp.zeros(size, a.dtype)))
+    start = vary_carry_alike((a, jnp.ones(size, bool), jnp.zeros(size, np.int32), jnp.zeros(size, a.dtype)))
     a, _, order, pivots = jax.lax.fori_loop(0, count, one_panel, start) if count > 1 else one_panel(0, start)
     return _permute_rows(a, order[:n])[:, :n], order[:n], pivots[:n]
 
@@ -165,7 +165,7 @@ def _eliminate_panel(panel: Array, free: Array) -> tuple[Array, Array, Array, Ar
         return panel, free & ~this_row, order, pivots
 
     width = panel.shape[1]
-    start = start_alike((panel, free, jnp.zeros(width, np.int32), jnp.zeros(width, panel.dtype)))
+    start = vary_carry_alike((panel, free, jnp.zeros(width, np.int32), jnp.zeros(width, panel.dtype)))
     return jax.lax.fori_loop(0, width, one_column, start)
 
 
@@ -309,7 +309,7 @@ def _factor_independent(matrix: Matrix, scale: Vector) -> tuple[Matrix, Matrix, 
         a = jnp.where(counts, _pivot_step(a, row, column)[0], a)
         return a, pairs + (row[:, None] & column & counts)
 
-    a, pairs = jax.lax.fori_loop(0, m, one_pivot, start_alike((matrix, jnp.zeros_like(matrix)), scale))
+    a, pairs = jax.lax.fori_loop(0, m, one_pivot, vary_carry_alike((matrix, jnp.zeros_like(matrix)), scale))
     rows, columns = jnp.sum(pairs, axis=1) > 0, jnp.sum(pairs, axis=0) > 0
     inverse = pairs.T @ jnp.where(rows[:, None] & columns, a, 0) @ pairs.T
     return inverse, pairs + jnp.where(~rows[:, None] & columns, -a, 0), pairs

@@ -30,7 +30,7 @@ from lagjax._interface import (
     require_flag,
     show_str,
 )
-from lagjax._primitives import lost_unless, marks_absent, raise_where_failed, sentence
+from lagjax._primitives import allows_nan, raise_where_failed, sentence, undefined_unless
 from lagjax._program import Unlowerable
 from lagjax._run._trajectory import Trajectory
 from lagjax._run.contacts import note_sections
@@ -65,7 +65,7 @@ class Crossings(NamedTuple):
         return f"{count.sum()} crossings{many}{when}, {'all there' if ok.all() else f'not all there in {(~ok).sum()}'}"
 
 
-@marks_absent
+@allows_nan
 def crossings(
     system: Scene,
     section: Callable | dict[str, Callable],
@@ -167,7 +167,7 @@ def _read_crossings(notes: tuple, ts, sections: int, count: int, layout: Layout,
     there = which == jnp.arange(sections)[:, None]
     places = jnp.argsort(~there, axis=1, stable=True)[:, :count]
     found = jnp.take_along_axis(there, places, axis=1)
-    t, y = lost_unless(found, t[places], inputs), lost_unless(found[..., None], y[places], inputs)
+    t, y = undefined_unless(found, t[places], inputs), undefined_unless(found[..., None], y[places], inputs)
     noted, many = Noted(t, y, there.sum(axis=1)), there.sum(axis=1) > count
     if throw:
         noted = _raise_unless_ok(layout, ts, end, noted, jnp.where(many.any(), _TOO_MANY, result))

@@ -30,7 +30,7 @@ from lagjax._interface import (
     require_flag,
     result_from,
 )
-from lagjax._primitives import marks_absent
+from lagjax._primitives import allows_nan
 from lagjax._run._trajectory import EACH, RunSettings, State, Trajectory, raise_unless_ok, step_counts
 from lagjax._run.contacts import follow_contacts, follow_contacts_batch
 from lagjax._run.hybrid import Hybrid, follow_modes
@@ -68,7 +68,7 @@ def _translate_keywords(function: Callable) -> Callable:
 
 
 @_translate_keywords
-@marks_absent
+@allows_nan
 def simulate(
     system: System | Hybrid,
     q0: PyTree,
@@ -207,7 +207,7 @@ def simulate(
 
 
 @_translate_keywords
-@marks_absent
+@allows_nan
 def simulate_batch(
     system: System | Hybrid,
     q0: PyTree,

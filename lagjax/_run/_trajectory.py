@@ -18,7 +18,7 @@ import numpy as np
 from lagjax._engine import AbstractEngine, Problem
 from lagjax._equations import has_constraints
 from lagjax._interface import ENDED_WELL, RESULTS, Layout, SimulationError, is_concrete, is_known, registered, show_str
-from lagjax._primitives import DOUBLE, compute_in_doubles, marks_absent, raise_where_failed
+from lagjax._primitives import DOUBLE, allows_nan, compute_in_doubles, raise_where_failed
 from lagjax._scene import System, describe_violation
 
 if TYPE_CHECKING:
@@ -290,7 +290,7 @@ class Trajectory(eqx.Module):
         code = self.result._value
         return (code == RESULTS.successful._value) | (code == RESULTS.event_occurred._value)
 
-    @marks_absent
+    @allows_nan
     def at(self, t) -> State:
         """The states at times t between the outputs, as exact as these: each by a run from the output before it.
 
@@ -340,7 +340,7 @@ class Trajectory(eqx.Module):
             raise ValueError("This motion has no contacts: give contacts=... or one_way=... to its System.")
         return self._forces_in_contact("contact_forces")
 
-    @marks_absent
+    @allows_nan
     def _forces_in_contact(self, name: str) -> PyTree:
         self._require_present()
         return registered().contact_forces(self, name)
@@ -385,7 +385,7 @@ class Trajectory(eqx.Module):
         """f and a at every output time, in the structure of `multipliers`: the drift off the constraints."""
         return self._map_outputs("constraint_residual")
 
-    @marks_absent
+    @allows_nan
     def health(self, reference: "Trajectory | None" = None) -> "lagjax.results.Health":
         """The trust that this motion deserves: conservation laws, constraints, the mass matrix, gradients.
 
@@ -498,7 +498,7 @@ class Trajectory(eqx.Module):
         for system in (self.system,) if isinstance(self.system, System) else self.system.values():
             system._require_present()
 
-    @marks_absent
+    @allows_nan
     def _map_outputs(self, name: str, *more: PyTree) -> PyTree:
         """Map a method (q, qdot, t, params, *more) of the system over time, and over the batch axes before it."""
         self._require_present()

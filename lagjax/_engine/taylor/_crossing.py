@@ -22,7 +22,7 @@ from lagjax._engine.taylor._flow import Flow, Tolerances
 from lagjax._engine.taylor._surfaces import Surfaces, crossing_variation, jumps_through_zero, require_one_number
 from lagjax._equations import Derivation
 from lagjax._interface import ENDED_WELL, EVENT_OCCURRED, halves
-from lagjax._primitives import attach_derivative, differentiable_where, lost_unless
+from lagjax._primitives import attach_derivative, differentiable_where, undefined_unless
 from lagjax._program import Unlowerable
 
 _BEFORE = 64 * np.finfo(np.float64).eps  # of the largest time: more than the rounding of a time, and of a border's
@@ -107,7 +107,7 @@ def motion_to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: T
     path, y_end, t_end = attach_derivative(run_again, values, ts, y0, params, solution.t_end, *where)
     well = jnp.isin(solution.result, jnp.asarray(ENDED_WELL))
     return solution._replace(
-        path=lost_unless(reached[:, None], path, (ts, y0, params)),
+        path=undefined_unless(reached[:, None], path, (ts, y0, params)),
         y_end=differentiable_where(well, y_end),
         t_end=differentiable_where(well, t_end),
     )
@@ -171,7 +171,9 @@ def motion_with_crossings(
     run_again = _crossings_variation(flow, surfaces, tolerances._replace(notes=0))
     t, y = attach_derivative(run_again, (noted.t, noted.y), ts, y0, params, noted.t)
     there, inputs = jnp.isfinite(noted.t), (ts, y0, params)
-    return solution, Noted(lost_unless(there, t, inputs), lost_unless(there[..., None], y, inputs), noted.count)
+    return solution, Noted(
+        undefined_unless(there, t, inputs), undefined_unless(there[..., None], y, inputs), noted.count
+    )
 
 
 @functools.lru_cache(maxsize=64)

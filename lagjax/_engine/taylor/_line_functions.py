@@ -31,7 +31,7 @@ from jax.interpreters import ad, mlir
 from lagjax._engine.taylor._call import NO_HANDLER, capsule
 from lagjax._equations import forms
 from lagjax._native import LARGEST_LINE, LineCode, compilation_work, line_handler, make_once
-from lagjax._primitives import HostFunction, LinearMap, call_host, compute_on_host, is_zero, share_rows
+from lagjax._primitives import HostFunction, LinearMap, broadcast_members, call_host, compute_on_host, is_zero
 from lagjax._program import (
     Graph,
     LinearSystem,
@@ -393,7 +393,7 @@ def _evaluate_scalars(equation, known: dict) -> Callable:
     program = lower(apply, *(jax.ShapeDtypeStruct(avals[k].shape, avals[k].dtype) for k in moving))
 
     def evaluate(*arrays):
-        arrays = share_rows(*(arrays[k] for k in moving))
+        arrays = broadcast_members(*(arrays[k] for k in moving))
         columns = [column for x in arrays for column in x.reshape(len(x), -1).T]
         parts = np.split(program.evaluate_many(columns).T, ends, axis=-1)
         return [x.reshape(-1, *of.shape).astype(of.dtype) for x, of in zip(parts, results, strict=True)]

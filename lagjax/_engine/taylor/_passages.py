@@ -17,7 +17,7 @@ _ROUNDING = 64 * np.finfo(float).eps  # of the time, or of coordinates: rounding
 
 
 def has_passages(kernel: Kernel) -> bool:
-    return kernel.borders is not None and bool(kernel.borders.abrupt)
+    return kernel.borders is not None and bool(kernel.borders.root_arguments)
 
 
 def part_passages(flow: Flow, steps: Steps, params, end, tolerances: Tolerances) -> Steps:
@@ -54,7 +54,7 @@ def _singular_arguments(steps: Steps, states, t, params, pieces) -> np.ndarray:
     """The numbers (K, S) that are zero where a root has no series, at S states of a member."""
     borders, chosen = steps.kernel.borders, steps.kernel.chosen
     assert borders is not None
-    line = eliminate_dead_code(borders.program.line, borders.abrupt)
+    line = eliminate_dead_code(borders.program.line, borders.root_arguments)
     numbers = params if chosen is None else params[list(chosen.positions)]
     return line.evaluate([*states.T, t, *np.broadcast_to(numbers, (len(t), len(numbers))).T, *pieces.T])
 

@@ -307,7 +307,7 @@ class Kernel:
     @property
     def rounds_of_rerun(self) -> int:
         """Rounds of a motion that a handler runs again for a derivative; 0 of a long or a piecewise one."""
-        if self.borders is not None and (self.borders.switches or self.borders.abrupt):
+        if self.borders is not None and (self.borders.switches or self.borders.root_arguments):
             return 0
         rounds = self._rounds // _RERUNS_PER_SLICE
         return rounds if rounds >= _LEAST_ROUNDS else 0

@@ -11,7 +11,7 @@ from lagjax._program import (
     Borders,
     Jump,
     Nesting,
-    Pieced,
+    PiecedProgram,
     Recurrent,
     Series,
     Unlowerable,
@@ -152,7 +152,7 @@ def choose_parameters(
 
         dtypes = (*one.dtypes[:first], *(kinds[i] for i in positions))
         size, mechanics = first + len(positions), reduce_line(getattr(one, "mechanics", None))
-        return Pieced(reduce_line(one.line), size, dtypes, one.linear, mechanics)
+        return PiecedProgram(reduce_line(one.line), size, dtypes, one.linear, mechanics)
 
     done = iter([reduce_program(one) for one in programs])
     return (

@@ -104,7 +104,7 @@ class BorderCrossing:
 
     def _pass_borders(self, frame: Frame, going: Value) -> None:
         """Go past borders and knots; the motion slides along no border that jumps there, and touches none such."""
-        shaken, code = self.borders.shaken, frame.code
+        shaken, code = self.borders.dependent_pieces, frame.code
         line = eliminate_dead_code(self.borders.program.line, [self.borders.decisions[j].switch for j in shaken])
         before = self.motion.evaluate_now(frame, line) if shaken else []
         before = [code.variable(before[k]) for k in range(len(shaken))]

@@ -69,7 +69,7 @@ TOGETHER = 1e-8
 HARDLY = 1e-6  # of the largest velocities so far: a contact that moves apart slower may close
 GAINED = 1e-12  # of the room of an impact: a gain of energy beyond rounding
 # Of the largest slip so far: what is more, where the slip along its first direction ends, has turned.
-TURNED = 1e-6
+RATE_JUMP_TOLERANCE = 1e-6
 # After a corner a motion continues from this fraction of the terms of its switching number beyond it. An event stops
 # it `BEFORE` the corner: steps that end at a border may be rejected, and halve the rest.
 BEYOND, BEFORE = 16.0 * EPS, 64.0 * SMALLEST_STEP
@@ -767,10 +767,10 @@ def close_contacts(scene: Scene, member: Member, first: int, hits: bool, meets: 
         closed[i] = float(stays or (meets[i] > 0 and parts[i] == 0))
     stops = False
     for c in range(r):
-        if k + c == first and was_stuck[c] == 0 and (d == 1 or slips[r + c] <= TURNED * member.slip[c]):
+        if k + c == first and was_stuck[c] == 0 and (d == 1 or slips[r + c] <= RATE_JUMP_TOLERANCE * member.slip[c]):
             stops = True
     for c in range(r):
-        fell = k + c == first and (was_stuck[c] > 0 or d == 1 or slips[r + c] <= TURNED * member.slip[c])
+        fell = k + c == first and (was_stuck[c] > 0 or d == 1 or slips[r + c] <= RATE_JUMP_TOLERANCE * member.slip[c])
         if closed[rough[c]] != was_closed[rough[c]]:
             sticks[c] = slips[c]
         else:

@@ -18,7 +18,7 @@ import numpy as np
 
 from lagjax._engine.taylor import Line, Surfaces, move_to_zero, run_stretch
 from lagjax._interface import halves
-from lagjax._primitives import differentiable_where, keep_together
+from lagjax._primitives import differentiable_where, limit_directions
 from lagjax._run.contacts._contact_search import HELD, POISSON
 from lagjax._run.contacts._impact_law import HeldRows, ImpactRows, construct_impulses, find_impulses, rates_behind
 from lagjax._run.jumps import Replay, SceneCode, join
@@ -73,7 +73,7 @@ class ContactReplay(Replay):
         _, said, behind, later, shared = jnp.split(ended, self._ends[[0, 5, 6, 7]])
         limits = jnp.append(row.shares, jnp.repeat(row.starts, self.sizes["D"]))
         limits = jnp.where(decides & (limits > 0), limits, jnp.inf)
-        behind = keep_together(behind, shared - still(shared), limits)  # only how they vary matters
+        behind = limit_directions(behind, shared - still(shared), limits)  # only how they vary matters
         last = row.end + jnp.where(decides, row.later_on, 0.0)
         later = later[0] + still(last - later[0])
         path = jnp.where((ahead & (ts <= row.end))[:, None], path[1:-1], 0.0)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine.taylor import Line
-from lagjax._primitives import Repetition, attach_derivative, differentiable_where, lost_unless
+from lagjax._primitives import Repetition, attach_derivative, differentiable_where, undefined_unless
 from lagjax._program import Unlowerable
 from lagjax._run.jumps._scene_code import Found, SceneCode
 from lagjax._tracing import lower
@@ -29,7 +29,7 @@ LONGEST_REPLAYED = 5000
 def mask_rows(there, x, inputs: tuple):
     """The numbers of rows, NaN where these are not `there`; and so is what varies with `inputs`, if it is traced."""
     there = there[(..., *[None] * (x.ndim - there.ndim))]
-    return lost_unless(there, x, inputs) if inputs else np.where(there, x, np.nan)
+    return undefined_unless(there, x, inputs) if inputs else np.where(there, x, np.nan)
 
 
 def join(*arrays):
