@@ -101,7 +101,7 @@ class Root(NamedTuple):
     residual: Callable[[], Program]
 
     def derive(self, of: "Line", differentiate: Callable, by: range, linear: int) -> StraightLine:
-        """`differentiate(line, types, by, outputs)`, `pushforward` or `pullback`, from (x, outputs, factors, v)."""
+        """The line of `differentiate`, `pushforward` or `pullback`, from (x, outputs, factors, v), by inputs `by`."""
         n, memo = of.outputs - 1, of.outputs + len(self.linear.factors)
         of_residual = differentiate(self.residual().line, [np.dtype(float)] * (of.size + n), by, range(n))
         solve = self.linear.solve()
