@@ -11,14 +11,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 from scipy.optimize import nnls
 
 from lagjax._analysis._scene_state import SceneState
 from lagjax._interface import Layout, accept, is_concrete, restrict_signature
 from lagjax._primitives import nan_unless
 from lagjax._scene import ROLES, Flat, System, replace_functions, require_system
-
-PyTree = Any
 
 # A gap or its rate that is zero, in sizes of its terms: what six digits, or a state in float32, leave of it.
 _CLOSED = 1e-6

@@ -10,14 +10,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from lagjax._analysis._scene_state import require_matrices
 from lagjax._analysis._solve import is_root, newton, shortest_preimage, shortest_solution
 from lagjax._interface import Function, Layout, accept, present, restrict_signature
 from lagjax._primitives import nan_unless
 from lagjax._scene import System, require_system
-
-PyTree = Any
 
 
 class ChangedCoordinates(NamedTuple):

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax._analysis._closed_contacts import HeldScene, hold_closed, one_sided_reason
 from lagjax._analysis._eigen import tangent_basis
@@ -31,7 +31,6 @@ from lagjax._primitives import accepts_singles, nan_unless
 from lagjax._run import simulate
 from lagjax._scene import Driven, System, asking_for_inputs, drive_scene, held_inputs, push_by_inputs, require_system
 
-PyTree = Any
 Vector = Float[Array, " n"]
 Matrix = Float[Array, "n n"]
 _SHOWN = 8  # equations that are printed

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, PyTree
 
 from lagjax._analysis._equilibrium import Steady, find_balance
 from lagjax._analysis._scene_state import SceneState, require_matrices
@@ -13,8 +13,6 @@ from lagjax._analysis._steady_symmetries import find_symmetries
 from lagjax._interface import describe_numbers, is_known, require_flag, show_str
 from lagjax._primitives import accepts_singles
 from lagjax._scene import System
-
-PyTree = Any
 
 
 class SteadyMotion(NamedTuple):

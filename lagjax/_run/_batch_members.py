@@ -7,12 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._interface import Layout, is_concrete, numbers_at
 from lagjax._run._trajectory import EACH, Trajectory
-
-PyTree = Any
-
 
 _SHARED = "shared"  # stands for the batch axis of what all members share
 

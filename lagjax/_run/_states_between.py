@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine import Batch
 from lagjax._interface import (
@@ -30,8 +31,6 @@ from lagjax._run._trajectory import RunSettings, State, Trajectory
 from lagjax._run.contacts import follow_contacts_batch
 from lagjax._run.hybrid import Hybrid, follow_modes
 from lagjax._scene import lift_batch
-
-PyTree = Any
 
 
 def find_states(run: Trajectory, t) -> State:

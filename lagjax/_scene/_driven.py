@@ -11,12 +11,11 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from lagjax._interface import Function, accept, restrict_signature
 from lagjax._interface.reads import Edition
 from lagjax._scene._system import ROLES, System, replace_functions
-
-PyTree = Any
 
 
 class Driven(NamedTuple):

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax._engine import Problem
 from lagjax._engine.taylor import lowered_motion
@@ -34,7 +34,6 @@ from lagjax._primitives import SINGLE, compute_in_doubles, nan_unless
 from lagjax._program import Unlowerable, lack_of_memory
 from lagjax._scene._explanation import Explanation, explain
 
-PyTree = Any
 # The functions of a scene by their roles, and the arguments of each that come by position.
 ARGUMENTS: dict[str, tuple[str, ...]] = {
     "lagrangian": ("q", "qdot"), "forces": ("q", "qdot"), "dissipation": ("q", "qdot"), "constraints": ("q",),

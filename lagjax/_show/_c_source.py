@@ -7,9 +7,10 @@ one Newton step back to them.
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._equations import Derivation, derivation_of
 from lagjax._interface import VERSION, Layout, number_names
@@ -21,7 +22,6 @@ from lagjax._tracing import Program, fold, lower_formula, stack
 if TYPE_CHECKING:
     from lagjax._scene import System
 
-PyTree = Any
 
 _HEAD = """\
 /* The equations of motion of a scene, by lagjax {version}, in C99 without libraries but math.h.

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._equations import Derivation, derivation_of
 from lagjax._interface import Layout, number_names, show_str
@@ -14,7 +15,6 @@ from lagjax._show._formula_text import LATEX, PYTHON, FormulaWriter, Name, input
 if TYPE_CHECKING:
     from lagjax._scene import System
 
-PyTree = Any
 
 # Operations of M, F, G and γ that are read: a double pendulum has 40, three links in space 400. Four times as many fill
 # ten pages, and take a second to put together.

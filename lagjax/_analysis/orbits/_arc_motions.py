@@ -7,12 +7,13 @@ nothing, and no kernel of LAPACK runs inside of one.
 """
 
 import copy
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._analysis._scene_state import require_matrices
 from lagjax._analysis.orbits._jumping_motions import JumpingMotions
@@ -31,8 +32,6 @@ from lagjax._interface import (
 from lagjax._primitives import sentence
 from lagjax._run.hybrid import Scene, first_law, jumps, laws, require_scene
 from lagjax._scene import ROLES, replace_functions, require_system
-
-PyTree = Any
 
 
 class Arc(NamedTuple):

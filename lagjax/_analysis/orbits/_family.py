@@ -14,11 +14,12 @@ Doedel et al., *Computation of periodic solutions of conservative systems*, Int.
 """
 
 import operator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._analysis.orbits import _shooting
 from lagjax._analysis.orbits._arc_motions import Arcs, starts
@@ -38,8 +39,6 @@ from lagjax._equations import decide, span_outside
 from lagjax._interface import Layout, halves, labelled_leaves, require_budget, require_tolerance
 from lagjax._primitives import accepts_singles
 from lagjax._scene import System
-
-PyTree = Any
 
 _SHORTEST = 1e-6  # of the first step: a family that asks for shorter ones ends
 

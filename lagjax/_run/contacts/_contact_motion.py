@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine.taylor import Surfaces, Tolerances, line_of, make_flow, require_one_number, vector_of
 from lagjax._equations import Derivation, derivation_of, forms
@@ -24,8 +25,6 @@ from lagjax._run.contacts._replay import ContactReplay, Played
 from lagjax._run.jumps import Found, JumpLaw, Mode, SceneCode, mask_rows
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes
 from lagjax._tracing import Program, compose, lower
-
-PyTree = Any
 
 LAW = JumpLaw(PLACES, LOOPS, ("RESTITUTION", "MU"), ("DOUBTS", "DOUBTED"))
 LAWS = "simultaneous", "sequential", "poisson"

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float
+from jaxtyping import Float, PyTree
 
 from lagjax._engine import DEFAULT_RTOL
 from lagjax._equations import derivation_of, forms
@@ -25,8 +25,6 @@ from lagjax._trust.checks import _constraint_checks, _derivative_checks, _jumps_
 from lagjax._trust.checks._findings import Finding, Findings
 from lagjax._trust.checks._mass import describe_direction
 from lagjax._trust.checks._scene_at_start import CheckedScene
-
-PyTree = Any
 
 # Units of atol: in a motion that is smaller, the errors that atol allows add up to a hundredth within a hundred steps.
 _SMALLEST_COORDINATE = 1e4
