@@ -6,8 +6,6 @@ matrix at states nearby, the linearised motion. What follows is NumPy and senten
 `_differences`), `_constraint_checks` (with contacts), `_mass`, `_jumps_near`, `_stiffness`.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
