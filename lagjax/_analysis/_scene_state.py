@@ -61,8 +61,7 @@ class SceneState(NamedTuple):
         _require_no_velocities(system, q, params)
         state = layout, layout.flatten(q), layout.flatten(rest), as_arrays(params, layout.dtype)
         if sparse and layout.size > forms.LARGEST_ANALYSED_DENSE and system.path == "auto":
-            functions = {role: getattr(system, role) for role in ROLES}
-            scene = cls.from_arguments(replace_functions(system, functions, "array"), *state)
+            scene = cls.from_arguments(replace_functions(system, {}, "array"), *state)
             if scene.large:
                 return scene
         return cls.from_arguments(system, *state)

@@ -84,7 +84,7 @@ def push_by_inputs(system: System) -> System:
 
     extras = {"inputs", *(() if own is None else own.extras)}
     pushed = accept(restrict_signature(forces, extras), "forces", extras=("t", "params", "inputs", "multipliers"))
-    return replace_functions(system, {role: getattr(system, role) for role in ROLES} | {"forces": pushed})
+    return replace_functions(system, {"forces": pushed})
 
 
 def asking_for_inputs(system: System) -> list[str]:

@@ -687,11 +687,17 @@ def present_system(system: System) -> System:
 
 
 def replace_functions(system: System, functions: dict[str, Function | None], path: str | None = None) -> System:
-    """The scene with other functions, by their roles, without the constructor: to read signatures takes long."""
-    other = object.__new__(type(system))
-    for name, value in (functions | {"path": path or system.path, "impacts": system.impacts}).items():
+    """The scene with some functions replaced, by their roles. The constructor would read all signatures again."""
+    other, fields = object.__new__(type(system)), object.__getattribute__(system, "__dict__")
+    for name, value in (fields | functions | {"path": path or fields["path"]}).items():
         object.__setattr__(other, name, value)
     return other
+
+
+def drop_contacts(system: System) -> System:
+    """The scene without contacts; itself where it has none."""
+    names = "contacts", "one_way", "restitution", "friction", "slip"
+    return replace_functions(system, dict.fromkeys(names)) if system.touches else system
 
 
 @eqx.filter_jit
