@@ -7,12 +7,13 @@ violations become error sentences. Traced values, as under `jax.jit`, are not te
 import dataclasses
 import functools
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._equations._constraints import ROUNDINGS, TOLERANCE, is_inconsistent, rows_of_terms, sizes
 from lagjax._equations._derivation import derivation_of
@@ -20,8 +21,6 @@ from lagjax._equations._linear import dependent_rows, diagonal_scale, schur_comp
 from lagjax._equations._many_states import Sample
 from lagjax._interface import Layout, is_concrete
 from lagjax._primitives import accepts_singles
-
-PyTree = Any
 
 
 @accepts_singles(("q0", "qdot0"), ("ts", "params"))

@@ -21,9 +21,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
-PyTree = Any
 Vector = Float[Array, " n"]  # one number for each coordinate
 Row = Float[Array, " m"]  # one number for each constraint
 Time = Float[Array, ""]

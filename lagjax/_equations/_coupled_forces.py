@@ -20,11 +20,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.interpreters.partial_eval import dce_jaxpr
+from jaxtyping import PyTree
 
 from lagjax._program import Unlowerable
 from lagjax._tracing import lower
-
-PyTree = Any
 
 # Steps of Newton's method. Each squares what is missing, times the part of λ that the force makes: from a tenth the
 # fourth is exact, from nine tenths the seventh; series of the motion converge alike. Pieces are known after one or two.

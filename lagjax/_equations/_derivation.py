@@ -18,6 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._equations import _form as forms
 from lagjax._equations._accelerations import Accelerations, lowered_once
@@ -34,8 +35,6 @@ from lagjax._interface import Layout, dtype_of, is_concrete
 from lagjax._primitives import DOUBLE
 from lagjax._program import Borders, Unlowerable, borders, lack_of_memory
 from lagjax._tracing import Program, lower, lower_scalars
-
-PyTree = Any
 
 
 class Derivation:

@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._equations._derivation import Derivation, columns_of, derivation_of, numbers_of
 from lagjax._equations._linear import factorize, saddle, saddle_many, schur_complements
@@ -21,8 +22,6 @@ from lagjax._equations._sparse import Diagonal, Entries
 from lagjax._interface import Layout, halves
 from lagjax._program import Unlowerable
 from lagjax._tracing import Program
-
-PyTree = Any
 
 SADDLE = ("mass_matrix", "force", "jacobian", "gamma")  # of M q̈ − Gᵀλ = F, G q̈ = γ
 _AT_ONCE = 2**20  # entries of mass matrices that XLA computes side by side, 8 MB: memory grows like their number

@@ -14,12 +14,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax._equations import _constraints, _linear
 from lagjax._equations._constraints import Constraints, Row, Time, Vector
 
-PyTree = Any
 Matrix = Float[Array, "n n"]
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]

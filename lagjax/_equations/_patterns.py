@@ -13,7 +13,6 @@ import functools
 import itertools
 import math
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import numpy as np
@@ -22,8 +21,6 @@ from jax.extend import core
 
 from lagjax._interface import compile_for_one_call
 from lagjax._program import lack_of_memory
-
-PyTree = Any
 
 # Entries that asdex visits one by one in Python, at some 10 µs each, to follow a product of matrices. Doubled, a
 # pattern takes up to 4 s.

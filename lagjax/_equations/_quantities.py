@@ -19,7 +19,6 @@ from lagjax._equations._saddle import SaddleElimination
 from lagjax._program import Derivatives, Tape, copy_nodes
 from lagjax._tracing import Expansion, has_own_rules, inputs_of
 
-PyTree = Any
 Ids = np.ndarray  # scalars of a graph, in the shape of the array that they stand for
 
 

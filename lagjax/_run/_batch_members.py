@@ -7,12 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._interface import Layout, is_concrete, numbers_at
 from lagjax._run._trajectory import EACH, Trajectory
-
-PyTree = Any
-
 
 _SHARED = "shared"  # stands for the batch axis of what all members share
 
@@ -57,6 +55,16 @@ def spread_params(trajectory: Trajectory, member: np.ndarray) -> tuple[PyTree, P
     return eqx.combine(jax.tree.map(lanes, numbers), code), axes
 
 
+def spread_rows(x, batch: tuple[int, ...], dimensions: int):
+    """An array of this many `dimensions` for every member of a batch, (N, …), also where all share it."""
+    library: Any = np if is_concrete(x) else jnp
+    x = library.asarray(x)
+    if x.ndim < len(batch) + dimensions:
+        x = library.expand_dims(x, x.ndim - dimensions)
+    own = x.shape[x.ndim - dimensions :]
+    return library.broadcast_to(x, batch + own).reshape(math.prod(batch), *own)
+
+
 class Members:
     def __init__(self, trajectory: Trajectory):
         self.batch = np.shape(trajectory.result._value)
@@ -88,11 +96,7 @@ class Members:
 
     def shared(self, x, dimensions: int) -> np.ndarray:
         """Times or tolerances, arrays of this many dimensions, broadcast to all members: (N, …)."""
-        x = np.asarray(x)
-        if x.ndim < len(self.batch) + dimensions:
-            x = np.expand_dims(x, x.ndim - dimensions)
-        own = x.shape[len(self.batch) :]
-        return np.broadcast_to(x, self.batch + own).reshape(self.count, *own)
+        return spread_rows(np.asarray(x), self.batch, dimensions)
 
     def numbers_of(self, k: int) -> np.ndarray:
         return np.array([x if np.ndim(x) == 0 else x[k] for x in self.numbers])

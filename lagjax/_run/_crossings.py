@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine import Problem, Solution
 from lagjax._engine.taylor import MachineCode, Noted, Surfaces, surfaces_of
@@ -36,7 +37,6 @@ from lagjax._run._trajectory import Trajectory
 from lagjax._run.contacts import note_sections
 from lagjax._run.hybrid import Hybrid, Scene, follow_modes, require_scene
 
-PyTree = Any
 _TOO_MANY = code_of(RESULTS.max_crossings_reached)
 
 

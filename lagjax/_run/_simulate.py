@@ -15,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine import AbstractEngine, Batch, Problem, Solution, axes_per_leaf, choose, requested_engine
 from lagjax._engine.taylor import MachineCode
@@ -39,7 +40,6 @@ from lagjax._scene import System, lift_batch, lift_problem, require_system
 if TYPE_CHECKING:
     import diffrax
 
-PyTree = Any
 
 _TIMES = "the times at which the state is wanted, from the start to the end, are ts"
 _ELSEWHERE = {  # words of SciPy and diffrax

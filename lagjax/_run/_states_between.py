@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine import Batch
 from lagjax._interface import (
@@ -25,13 +26,11 @@ from lagjax._interface import (
     require_numbers,
     result_from,
 )
-from lagjax._run._batch_members import spread_params
+from lagjax._run._batch_members import spread_params, spread_rows
 from lagjax._run._trajectory import RunSettings, State, Trajectory
 from lagjax._run.contacts import follow_contacts_batch
 from lagjax._run.hybrid import Hybrid, follow_modes
 from lagjax._scene import lift_batch
-
-PyTree = Any
 
 
 def find_states(run: Trajectory, t) -> State:
@@ -109,7 +108,7 @@ class LanePlaces(NamedTuple):
     @classmethod
     def from_trajectory(cls, run: Trajectory, times, batch: tuple[int, ...]) -> "LanePlaces":
         """The positions of times (N, K); raises `ValueError` if one lies outside of the motion."""
-        ts = _spread_rows(run.ts, batch, 1)
+        ts = spread_rows(run.ts, batch, 1)
         xp: Any = np if all(map(is_concrete, (times, ts))) else jnp
         ts, times = (xp.asarray(x) for x in (ts, times))
         way = xp.where(ts[:, -1:] > ts[:, :1], 1, -1).astype(ts.dtype)
@@ -121,7 +120,7 @@ class LanePlaces(NamedTuple):
         rows = np.arange(len(ts))[:, None]
         is_output = inside & (ts[rows, output] == times)
         # As far as the motion came: a run begins at an output that was reached.
-        end, code = (_spread_rows(x, batch, 0)[:, None] for x in (run.end.t, run.result._value))
+        end, code = (spread_rows(x, batch, 0)[:, None] for x in (run.end.t, run.result._value))
         known = xp is np and all(map(is_concrete, (end, code)))
         library: Any = np if known else jnp
         end, code = library.asarray(end), library.asarray(code)
@@ -206,16 +205,6 @@ def _spread_times(run: Trajectory, t, batch: tuple[int, ...]) -> tuple[Any, tupl
             f"its own, which broadcast with ({', '.join(map(str, batch))}, K): K = 1 for one time each."
         ) from None
     return times.reshape(-1, t.shape[-1]), shape
-
-
-def _spread_rows(x, batch: tuple[int, ...], dimensions: int):
-    """An array with `dimensions` own axes, broadcast to all members, (N, …)."""
-    library: Any = np if is_concrete(x) else jnp
-    x = library.asarray(x)
-    if x.ndim < len(batch) + dimensions:
-        x = library.expand_dims(x, x.ndim - dimensions)
-    own = x.shape[x.ndim - dimensions :]
-    return library.broadcast_to(x, batch + own).reshape(-1, *own)
 
 
 # ---- what can be wrong -----------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine import AbstractEngine, Problem
 from lagjax._equations import has_constraints
@@ -24,7 +25,6 @@ from lagjax._scene import System, describe_violation
 if TYPE_CHECKING:
     import lagjax
 
-PyTree = Any
 Number = jax.Array | np.ndarray
 
 

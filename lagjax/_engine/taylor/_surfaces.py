@@ -10,12 +10,13 @@ and likewise to second order (`crossing_variation`).
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine.taylor._line_functions import outputs
 from lagjax._equations import Derivation, forms
@@ -23,8 +24,6 @@ from lagjax._native import SINGLE_NOISE, Guards
 from lagjax._primitives import differentiable_where
 from lagjax._program import StraightLine, Unlowerable, borders, copy_nodes, distances, tangents_in
 from lagjax._tracing import Program, Scalars, absolute, compose, fold, lower, lower_scalars, stack
-
-PyTree = Any
 
 
 class Surfaces(NamedTuple):

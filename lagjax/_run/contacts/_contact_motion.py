@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine.taylor import Surfaces, Tolerances, line_of, make_flow, require_one_number, vector_of
 from lagjax._equations import Derivation, derivation_of, forms
@@ -24,8 +25,6 @@ from lagjax._run.contacts._replay import ContactReplay, Played
 from lagjax._run.jumps import Found, JumpLaw, Mode, SceneCode, mask_rows
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes
 from lagjax._tracing import Program, compose, lower
-
-PyTree = Any
 
 LAW = JumpLaw(PLACES, LOOPS, ("RESTITUTION", "MU"), ("DOUBTS", "DOUBTED"))
 LAWS = "simultaneous", "sequential", "poisson"
@@ -199,7 +198,8 @@ def _make_scene(
     acceleration = line_of((open_derivation if corners is None else derivation).accelerations.program, n)
     lines = {"RESPONSE": line_of(response), "BENDS": line_of(bends).with_derivative, "ACCELERATION": acceleration}
     if scene.system.impacts == "poisson" and r:
-        lines["CONSTRUCT"] = line_of(lower(_routh_construction, jax.ShapeDtypeStruct((8,), float)))
+        construct = lambda x: construct_impulses(x[:4].reshape(2, 2), x[4:6], x[6:7], x[7:])  # noqa: E731
+        lines["CONSTRUCT"] = line_of(lower(construct, jax.ShapeDtypeStruct((8,), float)))
     if corners is not None:
         lines["SIDES"] = line_of(corners.sides)
         lines["SIDE_SLOPES"] = lines["SIDES"].forward
@@ -217,11 +217,6 @@ def _make_scene(
     searched = SceneCode(LAW, sizes, arrays, modes, lines, tolerances)
     flow = functools.cache(functools.partial(make_flow, derivation, scene.path, None))
     return SearchedScene(ContactReplay(searched, flow), flat, _lower_coefficients(flat, derivation.numbers.params))
-
-
-def _routh_construction(x):
-    """Routh's construction, from one vector: coupling (2, 2) and rates (2,) of a contact, then e and μ."""
-    return construct_impulses(x[:4].reshape(2, 2), x[4:6], x[6:7], x[7:])
 
 
 def _lower_coefficients(flat: Flat, numbers: PyTree) -> Program | None:

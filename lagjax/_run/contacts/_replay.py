@@ -101,17 +101,16 @@ class ContactReplay(Replay):
         smooth, *moved = move_to_zero(self._find_watches(), row.watch.astype(int), crosses, moving, still)
         ends = zip(moved, moving[:2], strict=True)
         t, y = (jnp.where(stays, start, jnp.where(crosses, *end)) for start, end in zip((t, y), ends, strict=True))
-        rows, vector = self.rows_at(t, y, given[5]), given[5]
+        vector = given[5]
+        response = self._lines["RESPONSE"](self._opened(t, y, vector))
+        rows = ImpactRows.split(response, self.sizes["HEIGHT"], y.size // 2)
         *impact, behind = self._impact_jump((t, y), rows, row, vector, restitution, friction)
         behind, later = jnp.where(decides, behind, y), t + jnp.where(decides, row.later_on, 0.0)
         shared = rows.values[:k], rows.gradients[k:] @ v0
         return join(jnp.where(smooth, 1.0, 0.0), t, halves(y)[1], *impact, behind, later, *shared)
 
-    def rows_at(self, t, y, vector) -> ImpactRows:
-        """The rows of all contacts at a state, with all open."""
-        return ImpactRows.split(self._lines["RESPONSE"](self._opened(t, y, vector)), self.sizes["HEIGHT"], y.size // 2)
-
     def _opened(self, t, y, vector):
+        """The inputs of lines at a state, with all contacts open."""
         k, r, d, doing = (self.sizes[name] for name in ("K", "R", "D", "DOING"))
         ones = jnp.ones(r + r * d)
         return jnp.concatenate([y, t[None], vector, jnp.zeros(k), ones, jnp.zeros(doing - k - ones.size)])

@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine import Problem
 from lagjax._engine.taylor import MachineCode
@@ -46,7 +47,6 @@ from lagjax._run.hybrid._transition_search import IN_ONE_PLACE
 from lagjax._run.jumps import tolerances_of
 from lagjax._scene import System, present_system, require_system
 
-PyTree = Any
 # The part of a motion below which a time between transitions is none: bounces that pile up come down to the rounding of
 # the time before they are given up, and a reset that leaves a motion on its surface does so behind a longer one.
 SUDDEN = 1e-9

@@ -8,7 +8,6 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -23,9 +22,6 @@ from lagjax._primitives import DOUBLE, SINGLE
 from lagjax._program import Unlowerable
 from lagjax._scene import System
 from lagjax._tracing import lower
-
-PyTree = Any
-
 
 FIRES = None, "beyond", "crossing"
 

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine import Problem
 from lagjax._engine.taylor import Tolerances, vector_of
@@ -22,8 +23,6 @@ from lagjax._run.hybrid._transition_replay import HybridReplay, PlayedModes
 from lagjax._run.hybrid._transition_search import LOOPS
 from lagjax._run.jumps import Found, JumpLaw, Mode, SceneCode, mask_rows
 from lagjax._scene import System
-
-PyTree = Any
 
 LAW = JumpLaw(PLACES, LOOPS, ("MODE",), ("LET_OUT", "MODE"))
 
