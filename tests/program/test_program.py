@@ -4,6 +4,7 @@ import itertools
 import time
 
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 import numpy as np
