@@ -46,6 +46,9 @@ static double maximum(double a, double b) { return a > b ? a : b > a ? b : a == 
     "minimum": """\
 static double minimum(double a, double b) { return a < b ? a : b < a ? b : a == b ? (signbit(a) ? a : b) : a + b; }
 """,
+    "logaddexp": """\
+static double logaddexp(double a, double b) { return a == b ? a + log1p(1.0) : maximum(a, b) + log1p(exp(-fabs(a - b))); }
+""",
     "take": """\
 /* The entry of a table with the whole number x. */
 static double take(const double *table, long stride, long count, double x)
