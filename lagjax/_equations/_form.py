@@ -93,7 +93,7 @@ class Form(NamedTuple):
     - `kind`: "scalar", as programs, operation by operation; "arrays", with M and G as matrices; "sparse", by their
       patterns.
     - `reason`: why they are no programs, as the end of a sentence; None where they are.
-    - `structure`: of sparse matrices. `operations`: those of L, or of the program, where they are counted.
+    - `structure`: that of sparse matrices. `operations`: the number in L, or in the program, where they are counted.
     """
 
     kind: Literal["scalar", "arrays", "sparse"]
@@ -107,7 +107,7 @@ class Form(NamedTuple):
 
     @property
     def mass(self) -> MatrixForm | None:
-        """The form of M where it is sparse."""
+        """The form of M if it is sparse, else None."""
         return self.structure and self.structure.mass
 
 
@@ -115,7 +115,7 @@ SCALAR = Form("scalar")
 
 
 def derived_form(motion: Motion, shapes: tuple, path: str, is_sparse_in_scalars: Callable[[], bool]) -> Form:
-    """The form in which a scene is derived, of the shapes of (q, q̇, t, params); sparse if it is large, and suits that.
+    """The form in which a scene is derived, from the shapes of (q, q̇, t, params); sparse if large and suitable.
 
     On the `path` "array" size alone decides. M that is not sparse as arrays may be so on scalars, where zeros cancel.
     """
@@ -148,7 +148,7 @@ def suits_programs(derivation: "Derivation", operations: int) -> bool:
 
 
 def form_in_xla(derivation: "Derivation") -> Form:
-    """The form of a scene that XLA compiles, by its path; `ValueError` where "scalar" is impossible."""
+    """The form of a scene that XLA compiles, by its path; `ValueError` if "scalar" is impossible."""
     arrays = derivation.form if derivation.form.is_sparse else Form("arrays")
     if derivation.path == "array":
         return arrays._replace(reason="asked for")

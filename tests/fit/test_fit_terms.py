@@ -77,6 +77,19 @@ def test_a_potential_is_found_among_powers_and_cosine(numbers):
     assert type(fit.params) is type(law.params0) and str(fit.selection) in str(fit)
 
 
+@pytest.mark.parametrize("units", [(1.0, 1.0), (1.7e-27, 1e-10), (6e24, 1e11)])
+def test_the_choice_is_the_same_in_atoms_and_planets(units):
+    """Masses and lengths in SI units; numbers of terms differ by 10⁴⁰. A law of q², q³ is found from all starts."""
+    mass, length = units
+    law = lagjax.terms({"q2": lambda q: q**2 / 2, "q3": lambda q: q**3, "q4": lambda q: q**4})
+    scene = lagjax.System(lambda q, v, params: 0.5 * mass * v**2 - law(q, params=params))
+    true = law.params0 | {"q2": 10.0, "q3": -10.0 / 6 / length}
+    ts = np.linspace(0.0, 10 * np.pi * np.sqrt(mass / 10.0), 201)
+    measured = record(scene, 0.3 * length, true, seed=2, ts=ts, scatter=1e-3 * length)
+    for start in (0.0, 5.0):
+        assert_truth(lagjax.fit(scene, measured, law.params0 | {"q2": start}), true)
+
+
 def test_friction_is_found():
     law, scene = FRICTION, SPRING
     true = {"k": 4.0, "friction": law.params0 | {"coulomb": 0.05, "viscous": 0.1}}

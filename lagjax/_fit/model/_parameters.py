@@ -263,8 +263,14 @@ class Parameters:
 
     def limits(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(low, high) between which one step of the search from u (F,) may lie."""
-        pairs = [part.transform.limits(u[own]) for own, _, part in self.cuts]
-        low, high = (np.concatenate([np.zeros(0), *ends]) for ends in zip(*pairs, strict=True)) if pairs else (u, u)
+        return self._join_limits([part.transform.limits(u[own]) for own, _, part in self.cuts])
+
+    def leaps(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(low, high) of the steps from u (F,) that end anywhere in the sets of numbers."""
+        return self._join_limits([part.transform.leaps(u[own]) for own, _, part in self.cuts])
+
+    def _join_limits(self, pairs: list) -> tuple[np.ndarray, np.ndarray]:
+        low, high = (np.concatenate([np.zeros(0), *(pair[k] for pair in pairs)]) for k in range(2))
         return low, high
 
     def take_step(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:

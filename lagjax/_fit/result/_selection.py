@@ -124,8 +124,9 @@ def _nested(a: "_TermFit", b: "_TermFit") -> bool:
 
 
 def _project(columns: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """The part of a vector (M,) that lies in the span of some columns (M, K)."""
-    decided = decide(columns, _ALONE**2)
+    """The part of a vector (M,) that lies in the span of some columns (M, K), whatever the units of each."""
+    norms = np.linalg.norm(columns, axis=0)
+    decided = decide(columns / np.where(norms > 0.0, norms, 1.0), _ALONE**2)
     basis = decided.left[:, : int(decided.rank)]
     return basis @ (basis.T @ target)
 

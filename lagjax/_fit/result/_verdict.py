@@ -201,7 +201,8 @@ def _disagreements(
     own = residuals.states + unknowns.own  # numbers of a record are taken out as its start is
     columns = np.concatenate([np.ones(own, bool), inside[unknowns.shared], [True]])
     variances = np.diag(known.covariance)[shared], np.diag(known.white)[shared]
-    shifts = shifts_without(own, triangles[..., columns], records, *variances)
+    prior = residuals.parameters.prior_weights[shared]
+    shifts = shifts_without(own, triangles[..., columns], records, *variances, prior)
     labels = [residuals.parameters.labels[k] for k in shared]
     worst = [(k, int(np.argmax(np.abs(shift.sizes)))) for k, shift in shifts.items()]
     worst = sorted((-abs(shifts[k].sizes[i]), k, i) for k, i in worst if abs(shifts[k].sizes[i]) > _DISAGREE)
@@ -235,20 +236,26 @@ class Shift(NamedTuple):
     explained: float
 
 
-def shifts_without(states: int, triangles, records: np.ndarray, variances, white) -> dict[int, Shift]:
+def shifts_without(states: int, triangles, records: np.ndarray, variances, white, prior) -> dict[int, Shift]:
     """The fit without one record, for each of them.
 
     `triangles` (N, …, 2n + F + 1) are those of the pieces, `records` (N,) says whose they are; `variances` (F,) are
-    those of u, and `white` (F,) what they were if residuals were white. A record without which something is not
-    seen is left out, since there is nothing that it could disagree with.
+    those of u, `white` (F,) what they were if residuals were white, and `prior` (F,) the weights of a prior of u, which
+    holds with and without the record. A record without which something is not seen is left out, since there is nothing
+    that it could disagree with.
     """
     # The residual is one more column of the parameters, so that the starts are taken out of it as well.
     own = eliminate_starts(np.concatenate([triangles, triangles[..., -1:]], axis=-1), triangles, states)
     size, growth = 1.0 / np.sqrt(white), np.sqrt(np.maximum(variances / white, 1.0))
-    whole, found = compress_rows(own.reshape(1, -1, own.shape[-1]))[0][:, :-1] / size, {}
+    held, found = np.pad(np.diag(prior), ((0, 0), (0, 1))), {}
+
+    def slopes_of(rows: np.ndarray) -> np.ndarray:
+        rows = np.concatenate([rows.reshape(-1, own.shape[-1]), held])
+        return compress_rows(rows[None])[0][:, :-1] / size
+
+    whole = slopes_of(own)
     for k in np.unique(records):
-        rows = own[records != k].reshape(-1, own.shape[-1])
-        rest = compress_rows(rows[None])[0][:, :-1] / size
+        rest = slopes_of(own[records != k])
         if decide(rest, _SEEN).rank < rest.shape[1]:
             continue
         mine = own[records == k].reshape(-1, own.shape[-1])
