@@ -26,7 +26,7 @@ from lagjax._equations._blame import pieces_of
 from lagjax._equations._coupled_forces import CoupledForces
 from lagjax._equations._form import SCALAR, Form, derived_form, form_in_xla
 from lagjax._equations._motion import Motion
-from lagjax._equations._patterns import gradient_memory, jacobian_pattern
+from lagjax._equations._patterns import count_equations, gradient_memory, jacobian_pattern
 from lagjax._equations._quantities import OwnRules, quantities, unbalanced_force
 from lagjax._equations._recursion import Recursion
 from lagjax._equations._sparse import MOST_COLORS
@@ -358,7 +358,16 @@ class Derivation:
         except Unlowerable:
             return False
         usual = not (program.looks_up or self.has_rules)
-        return usual and self.layout.dtype == DOUBLE and program.operations <= forms.LARGEST_DIFFERENTIATED
+        return usual and self.layout.dtype == DOUBLE and forms.suits_programs(self, program.operations)
+
+    @functools.cached_property
+    def equations(self) -> int:
+        """The equations of JAX that L, forces, dissipation and constraints are written in."""
+        functions = [jax.make_jaxpr(f)(*self.state_shapes) for f in self._traced_once.functions]
+        q, _, t, numbers = self.state_shapes
+        if self.motion.constrained:
+            functions.append(jax.make_jaxpr(self._traced_once.constraints.f)(q, t, numbers))
+        return sum(count_equations(of.jaxpr) for of in functions)
 
     @property
     def traced_operations(self) -> int:

@@ -230,6 +230,12 @@ def count_operations(jaxpr) -> int:
     return count
 
 
+def count_equations(jaxpr) -> int:
+    """The equations of a jaxpr, and of those that it calls; those of a loop count once."""
+    inner = [list(core.jaxprs_in_params(equation.params)) for equation in jaxpr.eqns]
+    return sum(sum(map(count_equations, of)) if of else 1 for of in inner)
+
+
 def _count_matrix_products(jaxpr) -> int:
     """The number of scalar products in matrix products, and of entries read by cumulative sums and transforms."""
     count = sum(map(_count_matrix_products, core.subjaxprs(jaxpr)))

@@ -132,6 +132,13 @@ def _select(predicate, no, yes):
     return np.where(predicate, yes, no)[()]
 
 
+def _log_of_sum(code, a, b):
+    """log(eᵃ + eᵇ), in machine code."""
+    difference = a - b
+    result = code.maximum(a, b) + code.library("log1p", code.library("exp", -abs(difference)))
+    return code.select(code.compare("==", difference, difference), result, a + b)
+
+
 # ---- pieces of formulas ----------------------------------------------------------------------------------------------
 
 
@@ -298,6 +305,14 @@ _ROWS = (
     _smooth_map("log1p", np.log1p, lambda f, c, w, u: _inverse(f, c, _one_plus(f, c, u))),
     _smooth_map("logistic", lambda x: 1 / (1 + np.exp(-x)), lambda f, c, w, u: f("sub", w, _square(f, w)),
               lambda code, a: 1.0 / (1.0 + code.library("exp", -a)), c="1.0 / (1.0 + exp(-{0}))"),
+    Operation(
+        "logaddexp", 2, np.logaddexp, _log_of_sum, commutative=True,
+        slopes=(
+            lambda f, c, w, u, v: f("logistic", f("sub", u, v)),
+            lambda f, c, w, u, v: f("logistic", f("sub", v, u)),
+        ),
+        latex=r"\log\left(e^{{{0}}} + e^{{{1}}}\right)",
+    ),
     _smooth_map("erf", np.vectorize(math.erf, otypes=[float]), lambda f, c, w, u: _gauss(f, c, u), simplify=_odd),
     _smooth_map("erfc", np.vectorize(math.erfc, otypes=[float]), lambda f, c, w, u: f("neg", _gauss(f, c, u))),
     # Circular functions

@@ -96,7 +96,9 @@ def _power_of_two(x):
     return jnp.where(jnp.isfinite(x), power, jnp.abs(x))
 
 
-WRITTEN: dict[str, Callable] = {"binade": _power_of_two, "trunc": jnp.trunc}  # operations that `lax` does not have
+WRITTEN: dict[str, Callable] = {  # operations that `lax` does not have
+    "binade": _power_of_two, "trunc": jnp.trunc, "logaddexp": jnp.logaddexp,
+}  # fmt: skip
 
 
 def _apply_operation(op: str, xs: list, attribute) -> jax.Array:

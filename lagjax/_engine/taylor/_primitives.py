@@ -323,7 +323,7 @@ def _curvature_transpose(cotangents, *args, **settings):
 def _batch_rule(primitive):
     def rule(args, axes, **settings):
         given = zip(args, axes, strict=True)
-        given = [jnp.expand_dims(x, 0) if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in given]
+        given = [x if axis == 0 else x[None] if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in given]
         outs = primitive.bind(*given, **settings)
         return outs, [0] * len(outs)
 

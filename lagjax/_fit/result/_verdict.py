@@ -255,16 +255,16 @@ def shifts_without(states: int, triangles, records: np.ndarray, variances, white
     holds with and without the record. A record without which something is not seen is left out, since there is nothing
     that it could disagree with.
 
-    With the rows m and residuals r of a record, and H = RᵀR of all with the prior, the singular values of
-    W = m R⁻¹ = U S Vᵀ are below 1. Without the record H is Rᵀ (1 − WᵀW) R, so that u moves by R⁻¹ V S (1 − S²)⁻¹ Uᵀ r
-    (Woodbury), and the variances grow by the diagonal of R⁻¹ V S² (1 − S²)⁻¹ Vᵀ R⁻ᵀ.
+    With the rows m and residuals r of a record, and H = RᵀR of all and the prior, W = m R⁻¹ = U S Vᵀ has its singular
+    values below 1. H − mᵀm = Rᵀ (1 − Wᵀ W) R, so that u moves by R⁻¹ V S (1 − S²)⁻¹ Uᵀ r (Woodbury), and the variance
+    that is missed is the diagonal of R⁻¹ V S² (1 − S²)⁻¹ Vᵀ R⁻ᵀ.
     """
     # The residual is one more column of the parameters, so that the starts are taken out of it as well.
     own = eliminate_starts(np.concatenate([triangles, triangles[..., -1:]], axis=-1), triangles, states)
     own = own.reshape(len(own), -1, own.shape[-1])
     size, growth = 1.0 / np.sqrt(white), np.sqrt(np.maximum(variances / white, 1.0))
-    every = np.concatenate([own.reshape(-1, own.shape[-1]), np.pad(np.diag(prior), ((0, 0), (0, 1)))])
-    whole = compress_rows(every[None])[0][:-1, :-1] / size
+    held = np.pad(np.diag(prior), ((0, 0), (0, 1)))
+    whole = compress_rows(np.concatenate([own.reshape(-1, own.shape[-1]), held])[None])[0][:-1, :-1] / size
     if decide(whole, _SEEN).rank < whole.shape[1]:
         return Shifts(np.zeros(0, int), np.zeros((0, len(white))), np.zeros(0))
     names, which = np.unique(records, return_inverse=True)

@@ -36,7 +36,7 @@ _WHOLE_FORMS = {
 _FORMS_OF_ALL = frozenset(("add", "sub", "mul", "neg", "select", "and", "or", "xor"))
 
 _ZEROS = re.compile(r"\.?0+p")
-_LITERAL, _CALL = re.compile(r"\d+\.\d+"), re.compile(r"\b(?!maximum|minimum)([a-z][a-z0-9]*)\(")
+_LITERAL, _CALL = re.compile(r"\d+\.\d+"), re.compile(r"\b(?!maximum|minimum|logaddexp)([a-z][a-z0-9]*)\(")
 
 # What a line may call, by name. `maximum` and `minimum` are those of LLVM: NaN where one number is, and 0 above −0.
 _HELPERS = {
@@ -45,6 +45,12 @@ static double maximum(double a, double b) { return a > b ? a : b > a ? b : a == 
 """,
     "minimum": """\
 static double minimum(double a, double b) { return a < b ? a : b < a ? b : a == b ? (signbit(a) ? a : b) : a + b; }
+""",
+    "logaddexp": """\
+static double logaddexp(double a, double b)
+{
+    return (a > b ? a : b) + (a == b ? log1p(1.0) : log1p(exp(-fabs(a - b))));
+}
 """,
     "take": """\
 /* The entry of a table with the whole number x. */

@@ -211,6 +211,8 @@ def formula_of(equation) -> str | None:
         called, floats = equation.params["name"], [jnp.issubdtype(x.dtype, jnp.floating) for x in operands]
         suits = called in _FORMULAS and len(floats) == _FORMULAS[called] and (all if called == "hypot" else any)(floats)
         return called if suits and _match_library_call(called, equation.params["jaxpr"]) is not None else None
+    if name == "custom_jvp_call" and len(operands) == 2:
+        return "logaddexp" if _match_library_call("logaddexp", equation.params["call_jaxpr"]) is not None else None
     if name != "custom_jvp_call" or len(operands) != 1:
         return None
     shape, dtype = operands[0].shape, operands[0].dtype
@@ -255,7 +257,8 @@ def _function_body(called: str, *operands, **options) -> core.ClosedJaxpr | None
     """The body of a JAX function for operands of these shapes and types."""
     given = [jax.ShapeDtypeStruct(shape, dtype, weak_type=weak) for shape, dtype, weak in operands]
     equations = jax.make_jaxpr(functools.partial(getattr(jnp, called), **options))(*given).eqns
-    return next((e.params["jaxpr"] for e in equations if e.params.get("name") == called), None)
+    rules = (e.params["call_jaxpr"] for e in equations if "call_jaxpr" in e.params)
+    return next((e.params["jaxpr"] for e in equations if e.params.get("name") == called), next(rules, None))
 
 
 _OWN_RULES = frozenset(("stop_gradient", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"))
@@ -428,6 +431,7 @@ LOWER.update({
     "shift_right_arithmetic": _shift_right,
     "divmod": _divide, "floor_divide": lambda *of: _divide(*of)[:1], "remainder": lambda *of: _divide(*of)[1:],
     "trunc": lambda expansion, params, x: [expansion.map("trunc", x)],
+    "logaddexp": lambda expansion, params, x, y: [expansion.map("logaddexp", x, y)],  # JAX's has borders
 })  # fmt: skip
 
 
