@@ -355,22 +355,24 @@ def test_accelerations_of_local_cubics_begin_where_parameters_are_far_off(factor
     assert fit.ok and fit.params["k"] == pytest.approx(4.0, rel=0.01) and fit.params["c"] == pytest.approx(0.3, rel=0.1)
 
 
+OSCILLATOR = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2)
+PENDULUM = lagjax.System(lambda q, v, params: 0.5 * v**2 + params["k"] * jnp.cos(q))
+
+
 def test_first_samples_find_a_frequency_where_starts_are_known():
     # Over seven periods the sum of squares has many minima; the sine of an angle is no position to read a start off.
-    scene = lagjax.System(lambda q, v, params: 0.5 * v**2 + params["k"] * jnp.cos(q))
     ts = np.linspace(0.0, 20.0, 401)
-    motion = lagjax.simulate(scene, 1.0, 0.0, ts, {"k": 5.0})
+    motion = lagjax.simulate(PENDULUM, 1.0, 0.0, ts, {"k": 5.0})
     values = {"sine": np.sin(np.asarray(motion.q)) + 1e-3 * np.random.default_rng(0).normal(size=ts.size)}
     record = lagjax.Record(ts, values, start=(1.0, 0.0))
     settings = {"observe": lambda q, v: {"sine": jnp.sin(q)}, "transforms": lagjax.positive}
-    assert not lagjax.fit(scene, record, {"k": 2.0}, method="whole", **settings).ok
-    found = lagjax.fit(scene, record, {"k": 2.0}, **settings)
+    assert not lagjax.fit(PENDULUM, record, {"k": 2.0}, method="whole", **settings).ok
+    found = lagjax.fit(PENDULUM, record, {"k": 2.0}, **settings)
     assert found.ok and found.params["k"] == pytest.approx(5.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("fitted", [False, True])
 def test_hundreds_of_records_have_the_least_squares_of_scipy(fitted):
-    scene = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2)
     rng, ts = np.random.default_rng(0), 0.2 * np.arange(5)
     starts = rng.normal(size=(400, 2))
 
@@ -381,7 +383,7 @@ def test_hundreds_of_records_have_the_least_squares_of_scipy(fitted):
     shown = motions(2.0, starts) + 1e-2 * rng.normal(size=(400, 5))
     begin = lagjax.Guess if fitted else lambda *pair: pair
     records = [lagjax.Record(ts, {"x": x}, start=begin(*y)) for x, y in zip(shown, starts, strict=True)]
-    found = lagjax.fit(scene, records, {"k": 1.0}, observe=lambda q, v: {"x": q})
+    found = lagjax.fit(OSCILLATOR, records, {"k": 1.0}, observe=lambda q, v: {"x": q})
 
     def residuals(x):
         if not fitted:
