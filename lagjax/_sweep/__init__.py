@@ -35,14 +35,7 @@ from lagjax._sweep._job import Job, precision
 from lagjax._sweep._members import axes_of
 from lagjax._sweep._statistics import Statistics, Summary, from_bytes, merge, summary
 from lagjax._sweep._status import Progress, Status, status
-from lagjax._sweep._workers import (
-    require_executor,
-    require_part,
-    run_store,
-    submit,
-    units_to_compute,
-    work,
-)
+from lagjax._sweep._workers import require_executor, require_part, run_store, submit, units_to_compute, work
 
 
 @dataclass(frozen=True)
