@@ -119,9 +119,8 @@ def swing_with_narrow_friction(q, v, params):
 @pytest.mark.parametrize("law", [jnp.tanh, jax.nn.sigmoid])
 @pytest.mark.parametrize("width", [1e-3, 1e-9])
 def test_tangents_by_the_weight_of_a_narrow_function_that_is_zero(law, width):
-    """A motion knows nothing of a term of weight zero: its steps are as long as they may be, and its tangents turn within
-    them. Of a damped oscillator with friction that is sgn(v), or half of that and a half, the tangent is closed in form.
-    """
+    """A motion knows nothing of a term of weight zero: its steps are as long as they may be, and its tangents turn
+    within them. For friction that is sgn(v), or half of that and a half, the tangent has a closed form."""
     scene = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2, forces=swing_with_narrow_friction)
     ts = np.linspace(0.0, 10.0, 101)
 

@@ -321,9 +321,9 @@ def _record_steps(flow: Flow, motions: Motions, tolerances: Tolerances) -> Itera
 def _suitable_steps(flow: Flow, steps: Steps, params, tolerances, excess, measure: Callable) -> Steps | None:
     """The steps of one member, divided until they are accurate for its tangents; None if that fails.
 
-    `excess` (1,), and the first result of `measure(steps)`, is the size of the last terms of the series, in units of the
-    limit; the record has it for each step. If it does not fall as the steps of a constrained motion do, it is rounding,
-    as near a dead centre: then its own steps are right.
+    `excess` (1,), and the first result of `measure(steps)`, is the size of the last terms of the series, in units of
+    the limit; the record has it for each step. If it does not fall as the steps of a constrained motion do, it is
+    rounding, as near a dead centre: then its own steps are right.
     """
     divided, found = steps, []
     for turn in range(TRIES):
