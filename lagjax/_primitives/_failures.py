@@ -39,11 +39,13 @@ def raise_where_failed(tree, result, end, t_last, names: tuple[str, ...]):
     ends with this one.
     """
     (passed,) = check_p.bind(*map(jnp.asarray, (result, end[0], t_last, end[1])), names=names)
+    return _nan_unless_passed(passed, tree)
 
+
+@functools.partial(jax.jit, inline=True)  # outside of `jit` one program
+def _nan_unless_passed(passed, tree):
     def checked(leaf):
-        if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
-            return leaf
-        return jnp.where(passed == 0, leaf, jnp.nan)
+        return jnp.where(passed == 0, leaf, jnp.nan) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
 
     return jax.tree.map(checked, tree)
 

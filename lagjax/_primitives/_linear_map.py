@@ -164,7 +164,7 @@ def batch_in_front(arrays, axes) -> list:
     """The arguments of a batching rule, each with the batch as first axis; unbatched ones are broadcast."""
     size = next(x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None)
     return [
-        jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+        x if axis == 0 else jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
         for x, axis in zip(arrays, axes, strict=True)
     ]
 

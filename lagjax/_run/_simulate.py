@@ -288,13 +288,13 @@ def simulate_batch(
 def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, y0, params: PyTree, params_axes=EACH):
     """The solution of a problem, or a batch, in the user's pytree; `y0` and `params` are those of all members."""
     # Where nothing is traced, the few numbers stay in NumPy: each one sent to JAX costs as much as ten steps.
-    restore, (q, qdot), (q_end, qdot_end) = problem.layout.restore, halves(solution.path), halves(solution.y_end)
-    arrays = problem.ts, restore(q), restore(qdot), solution.result
+    fields = problem.layout, solution.path, solution.y_end, solution.accepted, solution.rejected
     if not isinstance(solution.y_end, np.ndarray):
-        ts, q, qdot, result = jax.tree.map(jnp.asarray, arrays)
+        (q, qdot, q_end, qdot_end), stats = _restore_traced(*fields)
+        ts, result = jnp.asarray(problem.ts), jnp.asarray(solution.result)
     else:
-        ts, q, qdot, result = _device_arrays(arrays)
-    stats = step_counts(solution.accepted, solution.rejected)
+        (q, qdot, q_end, qdot_end), stats = _restore_fields(*fields)
+        ts, q, qdot, result = _device_arrays((problem.ts, q, qdot, solution.result))
     if solution.idle is not None:
         stats["num_wasted_lane_steps"] = solution.idle
     event = None
@@ -302,11 +302,19 @@ def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, 
         of, ended = jax.tree.structure(problem.event.conditions, is_leaf=callable), jnp.asarray(solution.event)
         event = of.unflatten([ended[..., k] for k in range(of.num_leaves)])
     return Trajectory.from_fields(
-        ts=ts, q=q, qdot=qdot, result=result_from(result), end=State(solution.t_end, restore(q_end), restore(qdot_end)),
+        ts=ts, q=q, qdot=qdot, result=result_from(result), end=State(solution.t_end, q_end, qdot_end),
         stats=stats, system=problem.system, params=params, params_axes=params_axes,
         settings=RunSettings.from_problem(problem, engine),
         tolerances=engine.tolerances(problem, y0), event=event,
     )  # fmt: skip
+
+
+def _restore_fields(layout: Layout, path, y_end, accepted, rejected):
+    """The pytrees of coordinates and velocities, at the outputs and at the end, and the counts of steps."""
+    return [layout.restore(half) for y in (path, y_end) for half in halves(y)], step_counts(accepted, rejected)
+
+
+_restore_traced = jax.jit(_restore_fields, static_argnums=0, inline=True)  # one program outside of `jit`
 
 
 def _refuse_options(scene: str, options: dict[str, Any]) -> None:

@@ -18,7 +18,17 @@ from jaxtyping import PyTree
 
 from lagjax._engine import AbstractEngine, Problem
 from lagjax._equations import has_constraints
-from lagjax._interface import ENDED_WELL, RESULTS, Layout, SimulationError, is_concrete, is_known, registered, show_str
+from lagjax._interface import (
+    ENDED_WELL,
+    RESULTS,
+    Layout,
+    SimulationError,
+    flatten_numbers,
+    is_concrete,
+    is_known,
+    registered,
+    show_str,
+)
 from lagjax._primitives import DOUBLE, allows_nan, compute_in_doubles, raise_where_failed
 from lagjax._scene import System, describe_violation
 
@@ -590,7 +600,7 @@ def raise_unless_ok(trajectory: Trajectory, layout: Layout, why: Callable[[], st
         return trajectory
     t_last = trajectory.ts[-1]
     if not all(is_known(leaf) for leaf in jax.tree.leaves((end, code, t_last))):
-        y_end = jnp.concatenate([layout.flatten(end.q), layout.flatten(end.qdot)])
+        y_end = flatten_numbers((end.q, end.qdot), layout.dtype)
         states = trajectory.q, trajectory.qdot, end
         states = raise_where_failed(states, code, (end.t, y_end), t_last, layout.names)
         return eqx.tree_at(lambda t: (t.q, t.qdot, t.end), trajectory, states)

@@ -283,7 +283,7 @@ def test_a_shift_without_a_record_is_that_of_the_fit_without_it(done):
         fits[0]._point, [np.sqrt(b.weights) / fits[0].noise_scale.sigma for b in fits[0].residual_function.batches]
     )  # fmt: skip
     variances = np.diag(whole.information.covariance), np.diag(whole.information.white)
-    shift = shifts_without(2, triangles, np.arange(4), *variances, np.zeros_like(variances[0]))[0].sizes
+    shift = shifts_without(2, triangles, np.arange(4), *variances, np.zeros_like(variances[0])).sizes[0]
     chance = np.sqrt(np.diag(fits[1].information.white) - np.diag(whole.information.white))
     np.testing.assert_allclose(shift, (fits[1].u - fits[0].u) / chance, atol=0.2)
 

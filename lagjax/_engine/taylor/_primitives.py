@@ -47,15 +47,7 @@ from lagjax._engine.taylor._state_rates import rate
 from lagjax._engine.taylor._variational import from_rows, to_rows
 from lagjax._interface import SUCCESSFUL, default_platform
 from lagjax._native import Begun, Projection
-from lagjax._primitives import (
-    NOT_EXPORTED,
-    LinearMap,
-    call_host,
-    compute_on_host,
-    cond_alike,
-    cotangent_of,
-    is_zero,
-)
+from lagjax._primitives import NOT_EXPORTED, LinearMap, call_host, compute_on_host, cond_alike, cotangent_of, is_zero
 from lagjax._program import Unlowerable
 from lagjax._tracing import Program
 
@@ -323,7 +315,7 @@ def _curvature_transpose(cotangents, *args, **settings):
 def _batch_rule(primitive):
     def rule(args, axes, **settings):
         given = zip(args, axes, strict=True)
-        given = [jnp.expand_dims(x, 0) if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in given]
+        given = [x if axis == 0 else x[None] if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in given]
         outs = primitive.bind(*given, **settings)
         return outs, [0] * len(outs)
 

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 
-from lagjax._native.code._ir import BIT, DOUBLE, INTEGER, POINTER, Code, Value, element_of
+from lagjax._native.code._ir import BIT, DOUBLE, INTEGER, POINTER, Code, Value, element_of, vector_type
 
 Index = int | Value
 Numbers = Any  # vectors by their numbers: a list of values whose indices are known, or `Vectors`
@@ -130,12 +130,12 @@ class Frame:
 
     def __getitem__(self, key: "str | tuple") -> Value:
         name, *indices = _key_parts(key)
-        return self.code.load(self.address(name, *indices), ir.VectorType(DOUBLE, self.width))
+        return self.code.load(self.address(name, *indices), vector_type(DOUBLE, self.width))
 
     def __setitem__(self, key: "str | tuple", value: "Value | float") -> None:
         if isinstance(value, Value) and element_of(value.it.type) == BIT:
             value = self.code.flag(value)
-        value = self.code.as_value(value, ir.VectorType(DOUBLE, self.width))
+        value = self.code.as_value(value, vector_type(DOUBLE, self.width))
         if self._mask is not None:
             value = self.code.select(self._mask, value, self[key])
         self.code.store(value, self.address(*_key_parts(key)))

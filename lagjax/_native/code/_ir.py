@@ -28,7 +28,7 @@ from lagjax._native.code._objects import load_or_make
 DOUBLE, INTEGER, BIT, POINTER = ir.DoubleType(), ir.IntType(64), ir.IntType(1), ir.PointerType()
 LINE_ARGUMENTS = [POINTER, POINTER, INTEGER, POINTER, INTEGER]  # those of a `LineCode`
 COUNTED = "counted"  # the name of the blocks at which counted loops begin
-_CONTRACT = ("contract",)
+_COMPARISONS = {"<": "lt", "<=": "le", ">": "gt", ">=": "ge", "==": "eq", "!=": "ne"}  # LLVM's names
 # What LLVM itself calls for an intrinsic that the processor has no instruction for.
 _BEHIND_INTRINSICS = ("rint", "round", "floor", "ceil", "trunc", "fma", "fmod")
 
@@ -83,23 +83,10 @@ def compile_module(
 ) -> tuple[llvm.ExecutionEngine, dict[str, int]]:
     """Compile a module: the engine, which owns the code, and the addresses of `functions`. Empties the module."""
     text = str(module)
-    _empty_module(module)
-    return compile_text(lambda: text, functions, text, LEVELS[len(text) > _LARGE] if level is None else level)
-
-
-def _empty_module(module: ir.Module) -> None:
-    """Remove the instructions of a module, so that reference counting frees them at once.
-
-    Every instruction refers to its block and every block to its instructions. Python's search for such cycles took a
-    quarter of the compile time.
-    """
-    for function in module.functions:
+    for function in module.functions:  # its instructions are freed at once
         for block in function.blocks:
             block.instructions.clear()
-            block.terminator = None
-        function.blocks.clear()
-        function.args = ()
-    module.globals.clear()
+    return compile_text(lambda: text, functions, text, LEVELS[len(text) > _LARGE] if level is None else level)
 
 
 def compile_text(
@@ -154,9 +141,23 @@ def _comparison_operator(op: str) -> "Callable[[Value, Any], Value]":
     return lambda x, y: x.code.compare(op, x, y)
 
 
-@dataclass(frozen=True, eq=False)
+class Instruction(str):
+    """The text of one of the instructions that most of a kernel is, and the name of its result.
+
+    llvmlite's own hold their operands and their block until a module is written: that took 11 µs for each of them
+    instead of 4, and more for Python's search for circles among them.
+    """
+
+    type: ir.Type
+    reference: str
+
+    def get_reference(self) -> str:
+        return self.reference
+
+
+@dataclass(slots=True, eq=False)
 class Value:
-    """The result of an instruction; `it` is the value of llvmlite, which has no usable type annotations."""
+    """The result of an instruction; `it` is llvmlite's value, or an `Instruction`. None of its fields ever changes."""
 
     code: "Code"
     it: Any
@@ -171,13 +172,13 @@ class Value:
         return self.code.intrinsic("fabs", self)
 
     def __neg__(self):
-        return Value(self.code, self.code.builder.fneg(self.it))
+        return self.code.operate("fneg", self)
 
     def __and__(self, other):
-        return Value(self.code, self.code.builder.and_(self.it, other.it))
+        return self.code.operate("and", self, other)
 
     def __or__(self, other):
-        return Value(self.code, self.code.builder.or_(self.it, other.it))
+        return self.code.operate("or", self, other)
 
     def __invert__(self):
         return Value(self.code, self.code.builder.not_(self.it))
@@ -199,6 +200,15 @@ class Variable:
         code.store(code.as_value(x, self._kind), self._place)
 
 
+@functools.cache
+def vector_type(kind: ir.Type, lanes: int) -> ir.VectorType:
+    return ir.VectorType(kind, lanes)  # keeps its text
+
+
+def _typed(x: Value) -> str:
+    return f"{x.it.type} {x.it.get_reference()}"
+
+
 def element_of(kind: ir.Type) -> ir.Type:
     """The element type of a vector type; a scalar type itself."""
     return kind.element if isinstance(kind, ir.VectorType) else kind
@@ -218,13 +228,26 @@ class Code:
         self, module: ir.Module, name: str, arguments: Sequence[ir.Type], lanes: int, result=None, public=False,
         rounds=False,
     ):  # fmt: skip
-        self.lanes, self.vector, self._flags = lanes, ir.VectorType(DOUBLE, lanes), () if rounds else _CONTRACT
+        self.lanes, self.vector, self._flags = lanes, vector_type(DOUBLE, lanes), "" if rounds else " contract"
         self.module = module
         self.function = ir.Function(module, ir.FunctionType(result or ir.VoidType(), arguments), name)
         if not public:
             self.function.linkage = "internal"
         self.builder: Any = ir.IRBuilder(self.function.append_basic_block("entry"))
         self.arguments = [Value(self, argument) for argument in self.function.args]
+
+    def _append(self, text: str, kind: ir.Type | None = None) -> Value:
+        """An instruction, at the end of the block: by its text, and the type of its result."""
+        name = self.function.scope.register("", deduplicate=True)
+        written = Instruction(text if kind is None else f'%"{name}" = {text}')
+        written.type, written.reference = kind, f'%"{name}"'
+        self.builder._insert(written)
+        return Value(self, written)
+
+    def operate(self, name: str, *xs: Value, kind: ir.Type | None = None) -> Value:
+        """An instruction on operands of one type, which is that of its result unless another is given."""
+        of = xs[0].it.type
+        return self._append(f"{name} {of} {', '.join([x.it.get_reference() for x in xs])}", kind or of)
 
     # ---- numbers ----
 
@@ -252,19 +275,19 @@ class Code:
         """The value a op b for doubles, vectors or integers; of a scalar and a vector, the scalar fills all lanes."""
         a, b = self._match_types(a, b)
         if isinstance(a.it.type, ir.IntType):
-            return Value(self, getattr(self.builder, {"div": "sdiv"}.get(op, op))(a.it, b.it))
-        flags = self._flags if op != "div" else ()
-        return Value(self, getattr(self.builder, "f" + op)(a.it, b.it, flags=flags))
+            return self.operate("sdiv" if op == "div" else op, a, b)
+        return self.operate(f"f{op}" if op == "div" else f"f{op}{self._flags}", a, b)
 
     def compare(self, op: str, a, b) -> Value:
         """The bits of a comparison; a comparison with NaN is false, except `!=`."""
         a, b = self._match_types(a, b)
-        if isinstance(a.it.type, ir.IntType):
-            return Value(self, self.builder.icmp_signed(op, a.it, b.it))
-        if isinstance(a.it.type, ir.VectorType) and a.it.type.element == BIT:
-            return Value(self, self.builder.icmp_unsigned(op, a.it, b.it))
-        ordered = self.builder.fcmp_unordered if op == "!=" else self.builder.fcmp_ordered
-        return Value(self, ordered(op, a.it, b.it))
+        kind, name = a.it.type, _COMPARISONS[op]
+        if element_of(kind) == DOUBLE:
+            name = f"fcmp {'u' if op == '!=' else 'o'}{name}"
+        else:
+            signs = "" if op in ("==", "!=") else "s" if isinstance(kind, ir.IntType) else "u"
+            name = f"icmp {signs}{name}"
+        return self.operate(name, a, b, kind=vector_type(BIT, kind.count) if isinstance(kind, ir.VectorType) else BIT)
 
     def _match_types(self, a, b) -> tuple[Value, Value]:
         types = [x.it.type for x in (a, b) if isinstance(x, Value)]
@@ -277,7 +300,7 @@ class Code:
             vector = isinstance(condition.it.type, ir.VectorType)
             yes = self.as_value(yes, self.vector if vector else DOUBLE)
         yes, no = self._match_types(yes, no)
-        return Value(self, self.builder.select(condition.it, yes.it, no.it))
+        return self._append(f"select  {', '.join(_typed(x) for x in (condition, yes, no))}", yes.it.type)
 
     def flag(self, condition: Value) -> Value:
         return self.select(condition, 1.0, 0.0)
@@ -323,13 +346,13 @@ class Code:
     def element(self, base: Value, index, kind: ir.Type = DOUBLE) -> Value:
         """The address of `base[index]` in an array of type `kind`."""
         index = self.as_value(index, INTEGER)
-        return Value(self, self.builder.gep(base.it, [index.it], source_etype=kind))
+        return self._append(f"getelementptr {kind}, {_typed(base)}, {_typed(index)}", base.it.type)
 
     def load(self, address: Value, kind: ir.Type) -> Value:
-        return Value(self, self.builder.load(address.it, typ=kind, align=self._alignment(kind)))
+        return self._append(f"load {kind}, {_typed(address)}, align {self._alignment(kind)}", kind)
 
     def store(self, x: Value, address: Value) -> None:
-        self.builder.store(x.it, address.it, align=self._alignment(x.it.type))
+        self._append(f"store {_typed(x)}, {_typed(address)}, align {self._alignment(x.it.type)}")
 
     def variable(self, start: Value) -> "Variable":
         with self.builder.goto_entry_block():

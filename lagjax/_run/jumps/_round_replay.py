@@ -91,7 +91,9 @@ class Replay:
         before = (ts <= begun[-1]) & ((begun[-1] > ts[0]) | (count == 0))  # one at the start is the first round's
         path, varying = jnp.where(before[:, None], y, 0.0), (ts, y0, *given)[: self._rounds.inputs]
         (t, y), (said, behind), (more,) = self._rounds(varying, (t, y), (found.record,), count)
-        known = (ts > ts[0]) | (count == 0) | (t > ts[0])  # no round gives outputs at a start that is an end
+        # No round gives outputs at a start that is an end. The time is that of the search: with it nothing asks for the
+        # values of the rounds where only their derivatives are wanted, and these are not played for them.
+        known = (ts > ts[0]) | (count == 0) | (found.ending[0] > ts[0])
         return differentiable_where(known[:, None], path + more), said, behind, t, y
 
     def _read(self, record):
