@@ -101,11 +101,15 @@ def test_friction_is_found():
         np.testing.assert_allclose([fit.params["friction"][name] for name in DRAG], [0.05, 0.1, 0, 0], atol=2e-3)
 
 
+READING = lagjax.terms({"viscous": lambda v, slow: -v, "fast": lambda v, slow: -v * jnp.exp(-((v / slow[0]) ** 2))})
+SLOWED = lagjax.System(
+    lambda q, v: 0.5 * v**2 - 0.5 * q**2,
+    forces=lambda q, v, params: READING(v, params["slow"], params=params["f"]),
+)
+
+
 def test_a_number_that_only_a_dropped_term_reads_stays_at_its_guess():
-    law = lagjax.terms({"viscous": lambda v, slow: -v, "fast": lambda v, slow: -v * jnp.exp(-((v / slow[0]) ** 2))})
-    scene = lagjax.System(
-        lambda q, v: 0.5 * v**2 - 0.5 * q**2, forces=lambda q, v, params: law(v, params["slow"], params=params["f"])
-    )
+    law, scene = READING, SLOWED
     guess = {"f": law.params0, "slow": np.array([0.2])}
     exact = lagjax.simulate(scene, 1.0, 0.0, TS, guess | {"f": law.params0 | {"viscous": 0.1}}).q
     record = lagjax.Record(TS, exact + 1e-3 * np.random.default_rng(0).normal(size=TS.size))

@@ -116,16 +116,18 @@ def swing_with_narrow_friction(q, v, params):
     return -0.1 * v - params["c"] * params["law"](v / params["width"])
 
 
+NARROW = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2, forces=swing_with_narrow_friction)
+
+
 @pytest.mark.parametrize("law", [jnp.tanh, jax.nn.sigmoid])
 @pytest.mark.parametrize("width", [1e-3, 1e-9])
 def test_tangents_by_the_weight_of_a_narrow_function_that_is_zero(law, width):
     """A motion knows nothing of a term of weight zero: its steps are as long as they may be, and its tangents turn
     within them. For friction that is sgn(v), or half of that and a half, the tangent has a closed form."""
-    scene = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2, forces=swing_with_narrow_friction)
     ts = np.linspace(0.0, 10.0, 101)
 
     def end(c):
-        return lagjax.simulate(scene, 1.0, 0.0, ts, {"c": c, "width": width, "law": law}).q[-1]
+        return lagjax.simulate(NARROW, 1.0, 0.0, ts, {"c": c, "width": width, "law": law}).q[-1]
 
     w, decay = np.sqrt(1 - 0.05**2), 0.05
     s = np.concatenate([[0.0], np.arange(1, 4) * np.pi / w, [10.0]])  # where v changes its sign, which begins as -1
@@ -143,11 +145,10 @@ def test_tangents_by_the_weight_of_a_narrow_function_that_is_zero(law, width):
 
 
 def test_tangents_are_none_where_a_step_passes_a_jump_unseen():
-    scene = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2, forces=swing_with_narrow_friction)
     params = {"width": 1e-6, "law": jnp.atan}
 
     def end(c):
-        return lagjax.simulate(scene, 1.0, 0.0, np.linspace(0.0, 10.0, 101), params | {"c": c}).q[-1]
+        return lagjax.simulate(NARROW, 1.0, 0.0, np.linspace(0.0, 10.0, 101), params | {"c": c}).q[-1]
 
     assert np.isnan(jax.jacfwd(end)(0.0)) and np.isnan(jax.jacrev(end)(0.0))
 
