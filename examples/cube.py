@@ -15,10 +15,9 @@ comes near the board, and compared with its record after 0.3 s.
 - All else is fitted by `lagjax.fit` to flights and the eight pictures after the first impact, beyond which a motion
   depends on its start by jumps. How fast the cube falls gives the scale of lengths; the centre that the cameras see
   sways about the mass centre as the cube turns; how low the centre is at the impact gives the radius of corners, and
-  what the impact changes gives inertia, friction and restitution. Pictures after it count less: the scene, not the
-  cameras, is what is wrong there.
-
-The intervals are those that pictures give. Impacts differ by more: fits to other ten tosses scatter by twice as much.
+  what the impact changes gives inertia, friction and restitution. Pictures after it count less: there the scene is
+  further from the truth than the cameras. Intervals are those that pictures give; impacts differ by more, and fits to
+  other ten tosses scatter by two to three times as much.
 
     python examples/cube.py tosses.npz [--follow OTHER.npz]
 """
@@ -26,7 +25,6 @@ The intervals are those that pictures give. Impacts differ by more: fits to othe
 import argparse
 import itertools
 from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +35,7 @@ from scipy.spatial.transform import Rotation
 import lagjax
 
 G, STEP = 187.21374, 1 / 148  # half edges of 52.4 mm per s²; s between pictures
-LATER = 0.3  # s
+FITTED, LATER = 10, 0.3  # tosses; s
 NEAR = 0.04  # the height of the lowest corner at which a flight ends
 AFTER, COUNT = 8, 1e-3  # pictures after a flight that are fitted, and how much each counts beside one of the flight
 CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
@@ -53,19 +51,19 @@ def rotate(turn, vectors):
     return (w**2 - u @ u) * vectors + 2 * (vectors @ u)[..., None] * u + 2 * w * jnp.cross(u, vectors)
 
 
-def places(q, params, points):
+def points_at(q, params, points):
     """Where points (…, 3) of the cube are, which are given from its centre."""
     return q["place"] + rotate(q["turn"], params["centre"] + points)
 
 
 def observe(q, qdot, params):
     """What the cameras see: the centre of the cube, and its turn."""
-    return {"place": places(q, params, np.zeros(3)), "turn": q["turn"]}
+    return {"place": points_at(q, params, np.zeros(3)), "turn": q["turn"]}
 
 
 def balls(q, params):
     """The centres (8, 3) of the rounded corners."""
-    return places(q, params, (params["scale"] - params["radius"]) * CORNERS)
+    return points_at(q, params, (params["scale"] - params["radius"]) * CORNERS)
 
 
 def gaps(q, params):
@@ -124,9 +122,9 @@ def seen_state(picture):
 def flight_length(toss):
     """How many pictures show the cube before a corner comes near the board."""
     lowest = np.array(
-        [np.min(places(seen_state(one), PUBLISHED, CORNERS)[:, 2]) for one in toss[: round(LATER / STEP)]]
+        [np.min(points_at(seen_state(one), PUBLISHED, CORNERS)[:, 2]) for one in toss[: round(LATER / STEP)]]
     )
-    return max(2, int(np.argmax(lowest < NEAR)))
+    return max(2, int(np.argmax(np.append(lowest < NEAR, True))))
 
 
 def measured_start(toss):
@@ -149,37 +147,27 @@ def measured_start(toss):
     return start
 
 
-class Errors(NamedTuple):
-    """How far N simulated tosses are from their records after `LATER`, (N,): places in half sides, angles in rad; NaN
-    where the motion did not come there."""
-
-    place: np.ndarray
-    angle: np.ndarray
-
-    def medians(self):
-        """Those of place and angle over all tosses."""
-        return np.nanmedian(self.place), np.nanmedian(self.angle)
-
-
-def follow_tosses(scene, tosses, law, times):
-    """What the cameras would see (N, T, 7) of N tosses at times (N, T), by a law: parameters of the scene."""
+def follow_tosses(scene, tosses, law, numbers):
+    """Pictures (N, T, 7) of N tosses simulated by a law, parameters of the scene; `numbers` (N, T) counts them from the
+    start."""
     starts = jax.tree.map(lambda *x: np.stack(x), *(measured_start(toss)(law) for toss in tosses))
 
     @jax.jit
     @jax.vmap
     def follow(start, ts):
-        run = lagjax.simulate(scene, *start, ts, law, throw=False)
+        run = lagjax.simulate(scene, *start, ts, law, throw=False, max_transitions=1024)  # a face may clatter
         seen = jax.vmap(observe, in_axes=(0, 0, None))(run.q, run.qdot, law)
         return jnp.concatenate([seen["place"], seen["turn"]], axis=1)
 
-    return np.asarray(follow(starts, times))
+    times = STEP * np.pad(numbers, ((0, 0), (1, 0)))
+    return np.asarray(follow(starts, times))[:, 1:]
 
 
-def compare_pictures(simulated, recorded):
-    """The `Errors` of simulated pictures (N, 7)."""
+def errors_of(simulated, recorded):
+    """How far simulated pictures (N, 7) are from recorded ones: places in half sides and angles in rad, (2, N)."""
     place = np.linalg.norm(simulated[:, :3] - recorded[:, :3], axis=1)
     turns = recorded[:, 3:] / np.linalg.norm(recorded[:, 3:], axis=1, keepdims=True)
-    return Errors(place, 2 * np.arccos(np.minimum(1.0, np.abs(np.sum(simulated[:, 3:] * turns, axis=1)))))
+    return np.stack([place, 2 * np.arccos(np.minimum(1.0, np.abs(np.sum(simulated[:, 3:] * turns, axis=1))))])
 
 
 def fit_tosses(scene, tosses):
@@ -192,25 +180,17 @@ def fit_tosses(scene, tosses):
         n = flight_length(toss)
         shown = toss[: n + AFTER]
         weights = np.where(np.arange(len(shown)) < n, 1.0, COUNT)
-        start = measured_start(toss)
-        records.append(lagjax.Record(STEP * np.arange(len(shown)), seen_state(shown), start=start, weights=weights))
+        ts, start = STEP * np.arange(len(shown)), measured_start(toss)
+        records.append(lagjax.Record(ts, seen_state(shown), start=start, weights=weights))
     guess = GUESS | {"level": float(level), "tilt": np.array(tilt)}
     free = {name: name not in ("level", "tilt") for name in guess}
     transforms = dict.fromkeys(guess) | WITHIN
+    noise = lagjax.StudentT()
     fit = lagjax.fit(
-        scene,
-        records,
-        guess,
-        observe=observe,
-        free=free,
-        transforms=transforms,
-        noise=lagjax.StudentT(),
-        method="whole",
+        scene, records, guess, observe=observe, free=free, transforms=transforms, noise=noise, method="whole"
     )
-    print(fit)
-    print(
-        f"the board: {level - fit.params['scale']:.4f} high, rises by {tilt[0]:.4f} along x and {tilt[1]:.4f} along y"
-    )
+    height = level - fit.params["scale"]
+    print(fit, f"\nthe board: {height:.4f} high, rises by {tilt[0]:.4f} along x and {tilt[1]:.4f} along y")
     return fit
 
 
@@ -229,7 +209,7 @@ def look(points):
 
 def cube_edges(q):
     """The edges (12, 2, 2) of the cube as they are seen."""
-    return look(places(q, PUBLISHED, CORNERS))[np.array(EDGES)]
+    return look(points_at(q, PUBLISHED, CORNERS))[np.array(EDGES)]
 
 
 def picture(q):
@@ -245,9 +225,8 @@ def draw_own_toss(run):
     axes.plot(*np.asarray(look(BOARD)).T, color="0.6")
     for k in range(0, len(run.ts), 8):
         edges = cube_edges(jax.tree.map(lambda x, k=k: x[k], run.q))
-        axes.plot(
-            *np.moveaxis(edges, -1, 0).swapaxes(1, 2), color=plt.colormaps["viridis"](0.9 * k / len(run.ts)), lw=1
-        )
+        lines, color = np.moveaxis(edges, -1, 0).swapaxes(1, 2), plt.colormaps["viridis"](0.9 * k / len(run.ts))
+        axes.plot(*lines, color=color, linewidth=1)
     axes.set(aspect="equal", title="Tossed, and at rest on a face")
     axes.axis("off")
     figure.savefig("out/cube.png")
@@ -255,29 +234,31 @@ def draw_own_toss(run):
 
 def draw_followed(scene, tosses, laws, off):
     """How far all tosses are off, and the toss of median error beside its record, at a few times."""
-    figure, axes = plt.subplots(1, 4, figsize=(11.0, 3.4), width_ratios=[1.5, 1, 1, 1])
+    figure, axes = plt.subplots(1, 4, figsize=(11.0, 3.4), width_ratios=[1.5, 1, 1, 1], layout="constrained")
     colors = dict(zip(laws, ("C0", "C1"), strict=True))
     for name, errors in off.items():
-        axes[0].scatter(errors.place, errors.angle, s=12, color=colors[name], label=name)
-        axes[0].scatter(*errors.medians(), s=220, marker="+", color=colors[name])
+        axes[0].scatter(*errors, s=12, color=colors[name], label=name)
+        axes[0].scatter(*np.nanmedian(errors, axis=1), s=220, marker="+", color=colors[name])
     axes[0].set(xscale="log", yscale="log", xlabel="place [half sides]", ylabel="angle [rad]")
     axes[0].set_title(f"off after {LATER} s (+ medians)")
+    axes[0].set_xticks([0.05, 0.1, 0.2, 0.5], ["0.05", "0.1", "0.2", "0.5"])
+    axes[0].minorticks_off()
     axes[0].legend(fontsize=8, loc="upper left")
 
-    errors = off["fitted"]
-    toss = tosses[int(np.nanargmin(np.abs(np.log(errors.place / errors.medians()[0]))))]
-    times = STEP * np.round(np.array(SHOWN) / STEP)
-    cubes = {"recorded": (toss[np.round(times / STEP).astype(int)], "0.75", 5)}
-    cubes |= {name: (follow_tosses(scene, [toss], law, times[None])[0], colors[name], 1) for name, law in laws.items()}
+    places = off["fitted"][0]
+    toss = tosses[int(np.nanargmin(np.abs(places - np.nanmedian(places))))]
+    numbers = np.minimum(np.round(np.array(SHOWN) / STEP).astype(int), len(toss) - 1)
+    cubes = {"recorded": (toss[numbers], "0.75", 5)}
+    for name, law in laws.items():
+        cubes[name] = follow_tosses(scene, [toss], law, numbers[None])[0], colors[name], 1
     for k, axis in enumerate(axes[1:]):
         for name, (pictures, color, width) in cubes.items():
             lines = np.moveaxis(cube_edges(seen_state(pictures[k])), -1, 0).swapaxes(1, 2)
             axis.plot(*lines, color=color, lw=width, solid_capstyle="round", label=[name] + 11 * ["_"])
-        axis.set_title(f"{times[k]:.1f} s")
+        axis.set_title(f"{SHOWN[k]} s")
         axis.set(aspect="equal")
         axis.axis("off")
-    axes[2].legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=3)
-    figure.suptitle("a toss of median error", x=0.7, fontsize=9)
+    axes[2].legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=3, title="a toss of median error")
     Path("out").mkdir(exist_ok=True)
     figure.savefig("out/cube_followed.png")
 
@@ -286,7 +267,6 @@ def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", type=Path, nargs="?", help="recorded tosses, an .npz; without it, a toss of our own")
     parser.add_argument("--follow", type=Path, help="other tosses, to be simulated; by default those left of FILE")
-    parser.add_argument("--tosses", type=int, default=10, help="how many tosses of the file are fitted")
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
     plt.style.use("lagjax.figures")
@@ -298,23 +278,21 @@ def main(argv=None):
         draw_own_toss(run)
         return run
     tosses = read_tosses(options.file)
-    chosen = np.linspace(0, len(tosses), options.tosses, endpoint=False).astype(int)  # of the whole session
+    chosen = np.linspace(0, len(tosses), FITTED, endpoint=False).astype(int)  # of the whole session
     fit = fit_tosses(scene, [tosses[k] for k in chosen])
     others = [toss for k, toss in enumerate(tosses) if k not in chosen]
     others = read_tosses(options.follow) if options.follow else others
     last = np.array([min(round(LATER / STEP), len(toss) - 1) for toss in others])
-    times = STEP * np.column_stack([np.zeros(len(last)), last])
     ends = np.stack([toss[k] for toss, k in zip(others, last, strict=True)])
     laws = {"fitted": fit.params, "published": PUBLISHED}
-    off = {name: compare_pictures(follow_tosses(scene, others, law, times)[:, -1], ends) for name, law in laws.items()}
+    off = {name: errors_of(follow_tosses(scene, others, law, last[:, None])[:, 0], ends) for name, law in laws.items()}
     draw_followed(scene, others, laws, off)
     for name, errors in off.items():
-        if lost := int(np.isnan(errors.place).sum()):
+        if lost := int(np.isnan(errors[0]).sum()):
             print(f"{name}: {lost} of {len(others)} tosses did not come to {LATER} s, and are not counted")
-    place, angle = off["published"].medians()
-    print(f"by the published numbers: place {place:.3f} and angle {angle:.3f} at {LATER} s")
-    place, angle = off["fitted"].medians()
-    print(f"followed: {len(others)} tosses, place {place:.3f} and angle {angle:.3f} at {LATER} s")
+    medians = {name: "place {:.3f} and angle {:.3f}".format(*np.nanmedian(x, axis=1)) for name, x in off.items()}
+    print(f"by the published numbers: {medians['published']} at {LATER} s")
+    print(f"followed: {len(others)} tosses, {medians['fitted']} at {LATER} s")
     return fit, off
 
 
