@@ -319,16 +319,15 @@ class AbstractEngine(abc.ABC):
         Their size is, in these first states, the largest coordinate, or where they begin at zero how far the largest
         velocity would lead; or the largest velocity, if that is smaller and not zero.
         """
-        rtol, atol, ts = self.rtol(problem), problem.tolerances[1], problem.ts
+        rtol, atol = self.rtol(problem), problem.tolerances[1]
         if atol is not None:
             return rtol, as_arrays(atol, problem.layout.dtype, "atol")
-        library = _array_library(y0, ts, rtol)
+        given = problem.ts, rtol, y0
+        if not all(map(_is_on_host, given)):  # a bound does not vary: where only derivatives are traced, it is known
+            given = jax.lax.stop_gradient(given)
         # Within `jit` an operation on an array of JAX is traced, even where its numbers are known.
-        ts, relative = library.asarray(ts), library.asarray(rtol)
-        far, fast = (library.abs(half).max(axis=-1) for half in halves(library.asarray(y0)))
-        far = library.where(far > 0, far, fast * abs(ts[..., -1] - ts[..., 0]))
-        size = library.minimum(*(library.where(x > 0, x, library.inf) for x in (far, fast))).min(initial=library.inf)
-        return rtol, relative * library.minimum(ATOL_OVER_RTOL, ATOL_OVER_MOTION * size)
+        compute = _absolute_tolerance if all(map(_is_on_host, given)) else _traced_absolute_tolerance
+        return rtol, compute(*map(np.asarray, given) if compute is _absolute_tolerance else given)
 
     @abc.abstractmethod
     def refuses(self, problem: Problem) -> str | None:
@@ -341,6 +340,16 @@ class AbstractEngine(abc.ABC):
     @abc.abstractmethod
     def solve_batch(self, batch: Batch) -> Solution:
         """The motions of all members."""
+
+
+def _absolute_tolerance(ts, rtol, y0, library: Any = np):
+    far, fast = (library.abs(half).max(axis=-1) for half in halves(y0))
+    far = library.where(far > 0, far, fast * abs(ts[..., -1] - ts[..., 0]))
+    size = library.minimum(*(library.where(x > 0, x, library.inf) for x in (far, fast))).min(initial=library.inf)
+    return rtol * library.minimum(ATOL_OVER_RTOL, ATOL_OVER_MOTION * size)
+
+
+_traced_absolute_tolerance = jax.jit(functools.partial(_absolute_tolerance, library=jnp), inline=True)
 
 
 # ---- vectors ---------------------------------------------------------------------------------------------------------

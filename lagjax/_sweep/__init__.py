@@ -8,9 +8,9 @@ _description   the scene and the user's functions; their text, by which stores a
 _files         the files of a store
 _batch         a batch of members: their motions, the crossings on the way, what is kept of each
 _job           a store with its functions in a process; the computation of a unit
-_begin         stores that are begun, and those that are there
+_begin         stores that are begun; of one that is there, whether its description is the same
 _extend        the part of a new store that another one has: members, or the starts of motions that continue
-_workers       units in this process, and by executors
+_workers       which units are still to be computed, and their computation here or by executors
 _status        the progress of a store
 """
 
@@ -23,6 +23,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._interface import output_times, require_flag
 from lagjax._run.hybrid import Hybrid, Scene, jumps, require_scene
@@ -42,8 +43,6 @@ from lagjax._sweep._workers import (
     units_to_compute,
     work,
 )
-
-PyTree = Any
 
 
 @dataclass(frozen=True)
