@@ -190,7 +190,7 @@ def fit_tosses(scene, tosses):
         scene, records, guess, observe=observe, free=free, transforms=transforms, noise=noise, method="whole"
     )
     height = level - fit.params["scale"]
-    print(fit, f"\nthe board: {height:.4f} high, rises by {tilt[0]:.4f} along x and {tilt[1]:.4f} along y")
+    print(f"{fit}\nthe board: {height:.4f} high, rises by {tilt[0]:.4f} along x and {tilt[1]:.4f} along y")
     return fit
 
 
