@@ -85,7 +85,7 @@ def test_a_cube_comes_to_rest_on_a_face(tmp_path, monkeypatch):
     assert_pictures([tmp_path / "out" / "cube.png"], tmp_path / "out", 1)
 
 
-@pytest.mark.slow  # three hundred tosses, whose corners strike ten times each
+@pytest.mark.slow  # five recorded tosses by each of 32 laws, whose corners strike ten times each
 @pytest.mark.skipif(not TOSSES.exists(), reason="the recorded tosses are not here")
 def test_recorded_tosses_of_a_cube(tmp_path, monkeypatch, capsys):
     """Half a side and 20° would be those of another face in a third of the tosses."""
@@ -93,7 +93,9 @@ def test_recorded_tosses_of_a_cube(tmp_path, monkeypatch, capsys):
     with np.load(TOSSES) as data:
         few = int(data["lengths"][:8].sum())
         np.savez(tmp_path / "few.npz", states=data["states"][:few], lengths=data["lengths"][:8])
-    laws, off = importlib.import_module("cube").main([str(TOSSES), "--follow", str(tmp_path / "few.npz")])
+    laws, off = importlib.import_module("cube").main(
+        [str(TOSSES), "--tosses", "5", "--follow", str(tmp_path / "few.npz")]
+    )
     assert 0.1 < laws["friction"] < 0.25 and abs(laws["height"]) < 0.05
     place, angle = off["fitted"].medians()
     assert place < 0.5 and angle < 0.35 and np.isfinite(off["fitted"].place).all()
