@@ -11,14 +11,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 from scipy.optimize import nnls
 
 from lagjax._analysis._scene_state import SceneState
 from lagjax._interface import Layout, accept, is_concrete, restrict_signature
 from lagjax._primitives import nan_unless
-from lagjax._scene import ROLES, Flat, System, replace_functions, require_system
-
-PyTree = Any
+from lagjax._scene import Flat, System, drop_contacts, replace_functions, require_system
 
 # A gap or its rate that is zero, in sizes of its terms: what six digits, or a state in float32, leave of it.
 _CLOSED = 1e-6
@@ -47,7 +46,7 @@ class HeldScene(NamedTuple):
         end = self.own + len(self.places)
         forces = jnp.zeros(len(self.names), multipliers.dtype)
         forces = forces.at[np.array(self.places, int)].set(multipliers[self.own : end])
-        rest, bare = jnp.concatenate([multipliers[: self.own], multipliers[end:]]), _drop_contacts(self.given)
+        rest, bare = jnp.concatenate([multipliers[: self.own], multipliers[end:]]), drop_contacts(self.given)
         of_constraints = bare._split_by_constraint(rest, layout, params) if bare._constraint_roles else None
         return of_constraints, self.flat.shapes.name_numbers(forces)
 
@@ -186,15 +185,9 @@ def _require_no_friction(flat: Flat, places: tuple[int, ...], params: PyTree, wh
             )
 
 
-def _drop_contacts(system: System) -> System:
-    names = ("contacts", "one_way", "restitution", "friction", "slip")
-    functions = {role: getattr(system, role) for role in ROLES} | dict.fromkeys(names)
-    return replace_functions(system, functions)
-
-
 def _hold_contacts(system: System, places: tuple[int, ...]) -> System:
     """The scene with these gaps among its constraints, and without contacts."""
-    bare, own, contacts = _drop_contacts(system), system.constraints, system.contacts
+    bare, own, contacts = drop_contacts(system), system.constraints, system.contacts
     if not places or contacts is None:
         return bare
 
@@ -205,4 +198,4 @@ def _hold_contacts(system: System, places: tuple[int, ...]) -> System:
 
     asked = set(contacts.extras) | set(() if own is None else own.extras)
     held = accept(restrict_signature(hold_gaps, asked, 1), "constraints", ("q",))
-    return replace_functions(bare, {role: getattr(bare, role) for role in ROLES} | {"constraints": held})
+    return replace_functions(bare, {"constraints": held})

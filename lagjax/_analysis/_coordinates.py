@@ -10,14 +10,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from lagjax._analysis._scene_state import require_matrices
 from lagjax._analysis._solve import is_root, newton, shortest_preimage, shortest_solution
 from lagjax._interface import Function, Layout, accept, present, restrict_signature
 from lagjax._primitives import nan_unless
 from lagjax._scene import System, require_system
-
-PyTree = Any
 
 
 class ChangedCoordinates(NamedTuple):
@@ -76,9 +75,6 @@ def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordin
     def compose_state(function: Function):
         return lambda Q, Qdot, t, params, **more: function(*old_state(Q, Qdot, t, params), t=t, params=params, **more)
 
-    def compose_place(function: Function):
-        return lambda Q, t, params: function(place(Q, t=t, params=params), t=t, params=params)
-
     def compose_force(function: Function):
         def forces(Q, Qdot, t, params, **more):
             force = compose_state(function)(Q, Qdot, t, params, **more)
@@ -93,7 +89,9 @@ def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordin
         change(system.lagrangian),
         forces=change(system.forces, compose_force),
         dissipation=change(system.dissipation),
-        constraints=change(system.constraints, compose_place, 1),
+        constraints=change(
+            system.constraints, lambda f: lambda Q, t, params: f(place(Q, t=t, params=params), t=t, params=params), 1
+        ),
         velocity_constraints=change(system.velocity_constraints),
         path=system.path,  # pyright: ignore[reportArgumentType]
     )

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 from scipy.sparse import diags_array
 
 from lagjax._analysis._closed_contacts import hold_closed
@@ -35,7 +35,6 @@ from lagjax._primitives import accepts_singles, nan_unless
 from lagjax._run import simulate
 from lagjax._scene import ROLES, System
 
-PyTree = Any
 Vector = Float[Array, " n"]
 Unknowns = Float[Array, " n+m"]  # q, then λ
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._solve import STEPS, is_root, newton, shortest_preimage
@@ -21,7 +21,6 @@ from lagjax._run import simulate
 from lagjax._scene import System, present_system, require_system
 from lagjax._show import canonical_summary
 
-PyTree = Any
 Vector = Float[Array, " n"]
 
 

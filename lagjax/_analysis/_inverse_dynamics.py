@@ -1,12 +1,10 @@
 """`inverse_dynamics`: the forces that an acceleration takes."""
 
-from typing import Any
+from jaxtyping import PyTree
 
 from lagjax._analysis._closed_contacts import hold_closed
 from lagjax._interface import Layout, is_concrete
 from lagjax._scene import System, Time, describe_violation, require_system
-
-PyTree = Any
 
 
 def inverse_dynamics(

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax._analysis._closed_contacts import HeldScene, hold_closed, one_sided_reason
 from lagjax._analysis._eigen import tangent_basis
@@ -31,7 +31,6 @@ from lagjax._primitives import accepts_singles, nan_unless
 from lagjax._run import simulate
 from lagjax._scene import Driven, System, asking_for_inputs, drive_scene, held_inputs, push_by_inputs, require_system
 
-PyTree = Any
 Vector = Float[Array, " n"]
 Matrix = Float[Array, "n n"]
 _SHOWN = 8  # equations that are printed
@@ -267,7 +266,8 @@ def linearize(
 
 def _require_inputs(system: System, sensor: Function | None, inputs: PyTree) -> PyTree:
     """The inputs, of floats. Raises where no function asks for them, or a constraint does."""
-    inputs = jax.tree.map(lambda x: 1.0 * x if _is_integer(x) else x, inputs)
+    integers = lambda x: eqx.is_array_like(x) and jnp.issubdtype(jnp.result_type(x), jnp.integer)  # noqa: E731
+    inputs = jax.tree.map(lambda x: 1.0 * x if integers(x) else x, inputs)
     Layout.from_numbers(inputs, "inputs", float)
     require_finite(inputs, "inputs")
     asking = asking_for_inputs(system)
@@ -282,10 +282,6 @@ def _require_inputs(system: System, sensor: Function | None, inputs: PyTree) -> 
             "no B says. Make what is prescribed a coordinate, with a force as the input that moves it."
         )
     return inputs
-
-
-def _is_integer(x: Any) -> bool:
-    return eqx.is_array_like(x) and jnp.issubdtype(jnp.result_type(x), jnp.integer)
 
 
 def _output_names(sensor: Function, scene: SceneState, driven: bool) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float, PyTree
 from scipy.sparse import csr_array, diags_array
 
 from lagjax._analysis._closed_contacts import hold_closed, one_sided_reason
@@ -32,7 +32,6 @@ from lagjax._interface import Layout, compile_for_one_call, is_concrete, show_st
 from lagjax._primitives import accepts_singles, nan_unless
 from lagjax._scene import System
 
-PyTree = Any
 Vector = Float[Array, " n"]
 Matrix = Float[Array, "n n"]
 

@@ -8,12 +8,12 @@ and is a symmetry where Λ = dG/dt for some gauge G(q, t). Then p·ξ − h τ �
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax._analysis._scene_state import SceneState
 from lagjax._equations import Motion
@@ -21,7 +21,6 @@ from lagjax._interface import Function, Layout, accept, present
 from lagjax._program import Unlowerable
 from lagjax._scene import System, present_system, require_system
 
-PyTree = Any
 Vector = Float[Array, " n"]
 
 

@@ -13,15 +13,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from lagjax._analysis._scene_state import SceneState
 from lagjax._equations import factorize
 from lagjax._interface import Layout, present, restrict_signature
 from lagjax._run import simulate
 from lagjax._scene import System
-
-PyTree = Any
 
 
 class Routhian(NamedTuple):

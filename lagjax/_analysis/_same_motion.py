@@ -1,11 +1,11 @@
 """`same_motion`: whether two Lagrangians are of one motion."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from lagjax._analysis._noether import FlatState, euler_lagrange
 from lagjax._analysis._random_states import perturb_last_digits, random_states
@@ -13,8 +13,6 @@ from lagjax._analysis._scene_state import SceneState
 from lagjax._interface import Layout, compile_for_one_call, show_str
 from lagjax._primitives import accepts_singles
 from lagjax._scene import System, require_system
-
-PyTree = Any
 
 # What may be left of the difference, beside the terms that cancel in it: rounding leaves some 1e-15 of them, and as
 # much of what the numbers of two scenes are made of. Where terms cancel within L more is left: this many times what it

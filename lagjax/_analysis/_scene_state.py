@@ -1,12 +1,12 @@
 """The door of the analysis: a scene with its state and its parameters, flat."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax._engine.taylor import lowered_motion
 from lagjax._equations import (
@@ -24,7 +24,6 @@ from lagjax._equations import (
 from lagjax._interface import Layout, as_arrays, is_concrete, require_finite
 from lagjax._scene import ROLES, System, replace_functions, require_system
 
-PyTree = Any
 Vector = Float[Array, " n"]
 
 
@@ -62,8 +61,7 @@ class SceneState(NamedTuple):
         _require_no_velocities(system, q, params)
         state = layout, layout.flatten(q), layout.flatten(rest), as_arrays(params, layout.dtype)
         if sparse and layout.size > forms.LARGEST_ANALYSED_DENSE and system.path == "auto":
-            functions = {role: getattr(system, role) for role in ROLES}
-            scene = cls.from_arguments(replace_functions(system, functions, "array"), *state)
+            scene = cls.from_arguments(replace_functions(system, {}, "array"), *state)
             if scene.large:
                 return scene
         return cls.from_arguments(system, *state)

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, PyTree
 
 from lagjax._analysis._equilibrium import Steady, find_balance
 from lagjax._analysis._scene_state import SceneState, require_matrices
@@ -13,8 +13,6 @@ from lagjax._analysis._steady_symmetries import find_symmetries
 from lagjax._interface import describe_numbers, is_known, require_flag, show_str
 from lagjax._primitives import accepts_singles
 from lagjax._scene import System
-
-PyTree = Any
 
 
 class SteadyMotion(NamedTuple):
@@ -123,7 +121,8 @@ def _held_coordinates(scene: SceneState, hold: Any) -> np.ndarray:
     if not (hold is None or np.iterable(hold)):
         raise TypeError(f"hold is a name, such as 'qdot[0]', or a tuple of names; got {hold!r}.")
     for wanted in (hold,) if isinstance(hold, str) else hold or ():
-        named = np.array([[_names_number(name, wanted) for name in of] for of in both])
+        within = (f"{wanted}[", f"{wanted}.") if isinstance(wanted, str) else ()
+        named = np.array([[name == wanted or name.startswith(within) for name in of] for of in both])
         if not named.any():
             raise ValueError(f"hold names {wanted!r}, and the numbers are {', '.join(sum(both, ())[:24])}.")
         chosen |= named
@@ -140,11 +139,6 @@ def _held_unknowns(scene: SceneState, chosen: np.ndarray, cyclic: np.ndarray, mo
                 "is constant in a steady motion."
             )
     return np.where(cyclic, chosen[1], chosen[0])
-
-
-def _names_number(name: str, wanted: Any) -> bool:
-    """True if `wanted` names this number, or an array or a pytree that contains it."""
-    return name == wanted or (isinstance(wanted, str) and name.startswith((f"{wanted}[", f"{wanted}.")))
 
 
 def _explain_failure(scene: SceneState, cyclic: np.ndarray, hold: Any) -> str:

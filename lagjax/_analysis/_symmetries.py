@@ -8,13 +8,13 @@ the expression of each coordinate at random states, and for the work of forces a
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax._analysis._gauge import changes_of, gauge_of, is_right
 from lagjax._analysis._noether import FlatState, charge_at, euler_lagrange, flat_generator, variation
@@ -27,8 +27,6 @@ from lagjax._interface import Layout, accept, compile_for_one_call, show_str
 from lagjax._primitives import accepts_singles
 from lagjax._run import Trajectory
 from lagjax._scene import System
-
-PyTree = Any
 
 # Singular values of the columns, which are of order one, below which a combination is a symmetry. Rounding leaves some
 # 1e-15 of the terms, and as much of what numbers of a scene are made of (a mass that is 0.1 · 3). What breaks a

@@ -1,8 +1,8 @@
 """Engines, which integrate: a flat `Problem` becomes a flat `Solution`.
 
-`_problem` holds `Problem`, `Batch`, `Solution` and what an engine is; `_choice` decides which engine integrates a
+`_problem` has `Problem`, `Batch`, `Solution` and the base class of engines; `_choice` decides which engine integrates a
 problem, and why. `taylor/` is Taylor series in machine code, `diffrax/` any solver of diffrax on any device.
-`_stop_reason` says what a motion ran into, from the accelerations about its last state.
+`_stop_reason` finds why a motion stopped, from the accelerations around its last state.
 """
 
 from lagjax._engine._choice import choose, requested_engine

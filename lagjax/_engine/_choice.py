@@ -11,7 +11,7 @@ from lagjax._engine.taylor import MachineCode
 
 
 class Choice(NamedTuple):
-    """The engine that integrates, and why that is not machine code: the end of a sentence, None where it is."""
+    """The engine that integrates, and the reason why it is not machine code (end of a sentence; None if it is)."""
 
     engine: AbstractEngine
     refusal: str | None
@@ -20,9 +20,9 @@ class Choice(NamedTuple):
 def requested_engine(
     solver=None, dt=None, adjoint=None, progress: Any = False, rtol=None, atol=None
 ) -> AbstractEngine | None:
-    """The engine that these arguments of `simulate` determine; None where they leave it open.
+    """The engine that these arguments of `simulate` require; None if they leave it open.
 
-    Raises `TypeError` or `ValueError` where they cannot be right, or contradict each other.
+    Raises `TypeError` or `ValueError` if they are invalid, or contradict each other.
     """
     if dt is not None and not (rtol is None and atol is None):
         raise ValueError("dt asks for fixed steps and rtol/atol for adaptive ones: give one or the other.")
@@ -41,7 +41,7 @@ _MACHINE_CODE = MachineCode()
 
 
 def choose(problem: Problem, requested: AbstractEngine | None = None, members: int = 1) -> Choice:
-    """The engine for one or `members` problems. Raises `ValueError` where the `requested` one, or all, refuse them."""
+    """The engine for one or `members` problems. Raises `ValueError` if the `requested` one, or all, refuse them."""
     if requested is None or isinstance(requested, MachineCode):
         refusal = _MACHINE_CODE.declines(problem) if requested is None else _MACHINE_CODE.lacks(problem)
         if refusal is None:
@@ -58,7 +58,7 @@ def choose(problem: Problem, requested: AbstractEngine | None = None, members: i
 
 
 def _import_diffrax() -> Any:
-    """The engine `Diffrax`, imported where it is needed: diffrax takes half as long as JAX."""
+    """The engine class `Diffrax`, imported on first use: importing diffrax takes half as long as JAX."""
     from lagjax._engine.diffrax import Diffrax
 
     return Diffrax

@@ -32,7 +32,7 @@ NARROW = 64.0  # smallest steps, about a state from which no step leads on
 
 
 class End(NamedTuple):
-    """The end of a motion, with any axes of members in front: `y` has a last axis of 2n, (q, q̇)."""
+    """The ends of motions, with any batch axes first: `y` has a last axis of 2n, (q, q̇)."""
 
     t: jax.Array
     y: jax.Array
@@ -44,10 +44,10 @@ class End(NamedTuple):
 
 @np.errstate(all="ignore")
 def what_stopped(acceleration: Callable, at: End, shrank, spent) -> tuple[jax.Array, jax.Array]:
-    """Flags of the members: the acceleration is not finite just ahead; it jumps there.
+    """Two flags per member: the acceleration is not finite just ahead; it jumps there.
 
-    `acceleration(t, y)` gives q̈, with a last axis of n. `shrank` are the members whose step became too small, `spent`
-    those whose budget of steps is spent; others are not looked at.
+    `acceleration(t, y)` gives q̈, with a last axis of n. `shrank` flags the members whose step became too small,
+    `spent` those whose budget of steps is used up; others are not examined.
     """
     on_host = isinstance(at.y, np.ndarray)
     library, loop, evaluate_each = (
@@ -95,7 +95,7 @@ def what_stopped(acceleration: Callable, at: End, shrank, spent) -> tuple[jax.Ar
 
 
 def _jump_window(library, at: End, smallest, shrank):
-    """The time before the end in which a jump is looked for."""
+    """The time span at the end of a motion in which a jump is searched for."""
     mean = abs(at.t - at.begin) / library.maximum(at.accepted, 1)
     fighting = at.rejected > FIGHTING * (at.accepted + at.rejected)
     wide = mean * library.where(fighting, FAR, NEAR)

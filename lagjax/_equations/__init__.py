@@ -1,15 +1,15 @@
 """The equations of motion of a Lagrangian: M, F, q̈ and λ, on arrays and on scalars.
 
 `_motion` derives momentum, mass matrix, force, acceleration, energy and multipliers on arrays, `_quantities` the same
-on scalars, operation by operation; `_coupled_forces` are those that read multipliers. `_constraints` holds constraint
-Jacobian, right-hand side, distances and projection; `_consistency` tests a start against them. `_linear` solves
-symmetric systems and saddle points as arrays, and `_rank` decides which singular values count as zero; `_patterns`
-finds the patterns of a large scene's matrices, `_sparse` solves by them, `_structure` holds its motion; `_saddle` is
-the same elimination on scalars, which keeps the zeros of a scene, and `_recursion` the one for chains in O(n). `_form`
-decides in which form a scene is evaluated, and has every number that this takes. `_derivation` keeps everything derived
-from a scene as scalar programs, each lowered once, `_accelerations` those of what is solved for; `_many_states`
-evaluates them at many states. `_scales` says how large coordinates, velocities and time are at a state; `_blame` which
-operations of a user's function are not finite or make it piecewise, and in which line.
+on scalars; `_coupled_forces` are forces that depend on multipliers. `_constraints` has constraint Jacobian, right-hand
+side, distances and projection; `_consistency` tests a start against them. `_linear` solves symmetric systems and saddle
+points as arrays, and `_rank` decides which singular values count as zero; `_patterns` finds the sparsity patterns of a
+large scene's matrices, `_sparse` solves with them, `_structure` is the motion of such a scene; `_saddle` is elimination
+on scalars, which keeps structural zeros, and `_recursion` the one for chains in O(n). `_form` decides in which form a
+scene is evaluated, and has all thresholds for it. `_derivation` keeps everything derived from a scene as scalar
+programs, each lowered once, `_accelerations` those of linear systems; `_many_states` evaluates them at many states.
+`_scales` measures the sizes of coordinates, velocities and time at a state; `_blame` finds the operations of a user's
+function that are not finite or piecewise, with their source line.
 """
 
 from lagjax._equations import _form as forms

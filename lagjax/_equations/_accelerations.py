@@ -1,11 +1,11 @@
-"""`Accelerations`: the linear systems of a scene on scalars, and all that is solved for by them.
+"""`Accelerations`: the linear systems of a scene on scalars, and the programs of their solutions.
 
     M x − Gᵀλ = b,    G x = c
 
-with b and c of the accelerations, or of the steps back to the constraints, for M that is regular (`program`) or need
-not be (`general`), is built by recursion, or need not be positive definite. Each is written down as formulas in JAX on
-scalars, which call the programs of a `Derivation`, and lowered: an elimination that is written in `jnp` costs nothing
-to test, and its derivatives are JAX's.
+where b and c belong to the accelerations, or to the steps back to the constraints. M is regular (`program`) or not
+necessarily (`general`), built by recursion, or possibly indefinite. Each system is written as formulas on scalars that
+call the programs of a `Derivation`, and then lowered: an elimination written in `jnp` is easy to test, and its
+derivatives are JAX's.
 """
 
 import functools
@@ -46,7 +46,10 @@ _INDEFINITE = "its mass matrix is not positive definite and needs pivoting"
 
 
 class _SaddleSystem(NamedTuple):
-    """M x − Gᵀλ = b, G x = c by the names of b (None: zero) and c, the `sign` of c, whether `velocities` are in G."""
+    """A saddle-point system M x − Gᵀλ = b, G x = `sign` c, with the names of the quantities b (None: zero) and c.
+
+    With `velocities` G has the constraints on velocities too.
+    """
 
     b: str | None
     c: str
@@ -61,7 +64,7 @@ _POSITION_STEP = _SaddleSystem(None, "residual", -1, velocities=False)
 
 
 def lowered_once(make: Callable) -> property:
-    """A property that is made once; what could not be lowered raises the same `Unlowerable` again, without the work."""
+    """A property that is computed once; an `Unlowerable` that it raised is raised again without repeating the work."""
     name = make.__name__
 
     @functools.wraps(make)
@@ -82,7 +85,7 @@ def lowered_once(make: Callable) -> property:
 
 
 class _MatrixEntries(NamedTuple):
-    """The numbers of a matrix that are not zero as it is derived, and their rows and columns."""
+    """The entries of a matrix that are not structurally zero, with their rows and columns, and its shape."""
 
     # An array of scipy.sparse, whose import takes a tenth of the first motion of a small scene, would be no shorter.
     values: np.ndarray
@@ -95,7 +98,7 @@ class _MatrixEntries(NamedTuple):
         return matrix
 
     def is_definite(self, least: float) -> bool:
-        """True if all eigenvalues of a symmetric matrix are larger than this."""
+        """True if all eigenvalues of this symmetric matrix are larger than `least`."""
         n = len(self.places[0]) if np.array_equal(*self.places) else -1
         if n == self.shape[0]:
             return bool(self.values.min(initial=np.inf) > least)
@@ -118,16 +121,16 @@ class Accelerations:
 
     @lowered_once
     def program(self) -> Program:
-        """q̈, then whether M, or its saddle point with the constraints, is singular.
+        """The program of q̈, then a flag: M, or its saddle point with the constraints, is singular.
 
-        Where L builds velocities by recursion, and that is shorter, they are eliminated, not M (see `_recursion`): the
-        last output tells where that does not hold.
+        If L builds velocities by recursion, and that is shorter, they are eliminated instead of M (see `_recursion`):
+        the flag is then set where that elimination fails.
 
-        With constraints M may be singular (a parameter may make it so) as long as the saddle point is not. To allow for
-        that costs three times the arithmetic. Where M is regular in general the program is therefore the regular-M
-        variant, and its last output tells where that would cost digits; there `otherwise()` is the general variant.
-        Machine code changes over where that comes about, with the numbers of the run at hand; XLA, which has to write
-        the program down before it knows them, takes the one that always holds (`Program.complete`).
+        With constraints M may be singular (for some parameters) as long as the saddle point is not. To allow for that
+        costs three times the arithmetic. If M is regular in general the program is therefore the regular-M variant, and
+        its flag is set where that would lose digits; there `otherwise()` is the general variant. Machine code changes
+        over when that happens, with the numbers of the run; XLA, which needs the program before the numbers, takes the
+        one that is always valid (`Program.complete`).
         """
         mechanics = self._kick_mechanics
         if (variant := self._recursive_acceleration()) is not None:
@@ -148,7 +151,7 @@ class Accelerations:
     def _kick_mechanics(self) -> StraightLine | None:
         """The quantities that decide where L jumps (`_kick.Mechanics`), as one line; None if nothing is piecewise.
 
-        Constraints that numbers release, those of contacts, are left out: they push, and do not pull.
+        Constraints that parameters can release, those of contacts, are left out: they push, and do not pull.
         """
         count, n = self.of.shape("rates")[0], self.layout.size
         holds = np.arange(count) if self.motion.constraints.held is None else np.flatnonzero(self.of.absent("release"))
@@ -162,7 +165,7 @@ class Accelerations:
 
     @lowered_once
     def multipliers(self) -> Program | None:
-        """λ, those of `constraints` first; redundant ones are zero. None without constraints."""
+        """The program of λ, those of `constraints` first; redundant ones are zero. None without constraints."""
         if not self.motion.constrained:
             return None
         system, solve = self._scalar_system(_ACCELERATION)
@@ -176,8 +179,8 @@ class Accelerations:
     def impact_response(self, rows: tuple[int, ...], states: int, free: "Derivation") -> Program:
         """The response to impulses at K `rows` of G: G, G M⁻¹ (K, n), G M⁻¹ Gᵀ (K, K), values, rates, G q̈ − γ (K,).
 
-        The last `states` parameters say what is held, and G is that where everything is. The motion where nothing is,
-        with q̈ and M⁻¹, which leaves the other constraints as they are, is that of `free`.
+        The last `states` parameters tell which contacts are closed; G is evaluated with all of them closed. q̈ and M⁻¹
+        are those of the motion with none closed, with its other constraints, which is `free`.
         """
         if rows in self._responses:
             return self._responses[rows]
@@ -199,7 +202,7 @@ class Accelerations:
 
     @lowered_once
     def projected(self) -> Program | None:
-        """(q, q̇) after one Newton step of each kind back to the constraints, as `Motion.projected`; or None."""
+        """The program of (q, q̇) after one Newton step each back to the constraints, as `Motion.projected`; or None."""
         if not self.motion.constrained:
             return None
         n = self.layout.size
@@ -216,7 +219,7 @@ class Accelerations:
 
     @lowered_once
     def velocity_scales(self) -> Program | None:
-        """The `velocity_scales` of a state, (n,); None without constraints."""
+        """The program of the `velocity_scales` of a state, (n,); None without constraints."""
         if not self.motion.constrained:
             return None
         n, (mass, rows) = self.layout.size, map(self.of.positions, _MATRICES)
@@ -234,26 +237,27 @@ class Accelerations:
 
     @lowered_once
     def projection(self) -> Projection | None:
-        """The programs by which machine code keeps a motion on its constraints; None without any."""
+        """The programs with which machine code keeps a motion on its constraints; None without any."""
         return None if self.projected is None else Projection(self.projected, self.velocity_scales)
 
     def _saddle_solution(self, saddle: _SaddleSystem, regular_only: bool = False) -> Program:
-        """x of a linear system, and then whether it is singular."""
+        """The program of x of a saddle-point system, and then a flag: it is singular."""
         system, solve = self._scalar_system(saddle, regular_only)
         return lower_solution(system, solve, self.layout.size, *self.of.scalar_shapes, budget=forms.OPERATION_BUDGET)
 
     @lowered_once
     def lacks(self) -> str | None:
-        """Why its accelerations are not solved for on scalars, as the end of a sentence; None where they are."""
+        """The reason why accelerations have no scalar program, as the end of a sentence; None if they have one."""
         try:
             self._scalar_system(_ACCELERATION)
         except Unlowerable as why:
             return str(why)
 
     def _scalar_system(self, saddle: _SaddleSystem, regular_only: bool = False) -> tuple[Callable, Callable]:
-        """A z = r with z = (x, −λ), as two functions of scalars.
+        """A z = r with z = (x, −λ), as two functions of scalars: system and solution.
 
-        The first gives the entries of A, r, factors of A and whether it is singular; the second z, of factors and r.
+        The first gives the entries of A, r, the factors of A and a flag that it is singular; the second z from factors
+        and r.
         """
         n, m, regular = self.layout.size, self._row_count(saddle), self._is_mass_regular(saddle)
         if regular is None and not self._mass_pivots:
@@ -288,7 +292,7 @@ class Accelerations:
         return system, elimination.solve
 
     def _recursive_acceleration(self) -> Program | None:
-        """q̈ by the recursion in L; None where there is none, or where it does not hold at a sampled state."""
+        """The program of q̈ by the recursion in L; None without one, or if it fails at a sampled state."""
         if self.of.recursion is None or self._is_mass_regular(_ACCELERATION) is None:
             return None
         elimination, n = RecursiveElimination(self.of.recursion, self.layout.dtype), self.layout.size
@@ -305,7 +309,7 @@ class Accelerations:
         return program if self._solves_equations(program) else None
 
     def _solves_equations(self, program: Program) -> bool:
-        """True if a program for q̈ gives that of M q̈ = F at the sampled states."""
+        """True if a program of q̈ gives the solution of M q̈ = F at the sampled states."""
         columns = self._input_columns()
         of = self.of.evaluate(["mass_matrix", "force"], columns)
         exact = solve_many(of["mass_matrix"], of["force"][:, :, None])[:, :, 0]
@@ -315,7 +319,7 @@ class Accelerations:
         return not singular[usable].any() and bool((error <= 1e-6 * np.abs(exact[usable]).max(initial=0)).all())
 
     def _elimination_parts(self, saddle: _SaddleSystem, elimination, constraints: int) -> Callable:
-        """A formula for the entries of an elimination, the `constraints` numbers of c, and b, end to end."""
+        """A formula of the entries of an elimination, `constraints` numbers of c, and b, concatenated."""
         n = self.layout.size
         row, column = elimination.entries.T
         names = "mass_matrix", "jacobian", "release", "drag"
@@ -339,7 +343,7 @@ class Accelerations:
         return not self.of.reads("mass_matrix")
 
     def samples(self, reach: float = 1.0, numbers: Any = None) -> "list[tuple[_MatrixEntries, _MatrixEntries]]":
-        """M and G at a few states that nothing speaks for, where they are finite; `numbers` are those of params."""
+        """M and G at a few generic states where they are finite; `numbers` are parameters to use."""
         if numbers is not None:
             return self._evaluate_matrices([*self._input_columns(reach)[: 2 * self.layout.size + 1], *numbers])
         if reach not in self._sampled:
@@ -348,7 +352,7 @@ class Accelerations:
 
     @functools.cached_property
     def _matrix_entries(self) -> Program:
-        """The numbers of M and G that are not zero as they are derived."""
+        """The program of the entries of M and G that are not structurally zero."""
         return self.of.whole.select_outputs([k for name in _MATRICES for k in self.of.filled_positions(name)])
 
     def _evaluate_matrices(self, columns: list) -> "list[tuple[_MatrixEntries, _MatrixEntries]]":
@@ -359,17 +363,17 @@ class Accelerations:
         return [tuple(map(make, of, places, shapes)) for of in samples]
 
     def _input_columns(self, reach: float = 1.0) -> list[np.ndarray]:
-        """The inputs at these states, one array (states,) for each: of order one, but q of this order."""
+        """The inputs at the sampled states, one array (states,) each: of order one, q of order `reach`."""
         n, columns = self.layout.size, np.random.default_rng(0).uniform(0.3, 1.2, (3, len(self.of.scalar_shapes))).T
         return [reach * x for x in columns[:n]] + list(columns[n:])
 
     def _is_mass_regular(self, saddle: _SaddleSystem) -> bool | None:
-        """True if M is regular in general: at all of the sampled states; None where it need not be positive definite.
+        """True if M is regular at all sampled states, False if not; None if M may be indefinite.
 
-        Elimination without pivoting is for positive definite M. With constraints M may be singular, and is then
-        augmented by GᵀG. The choice is between right answers: a wrong guess is caught by the test on the pivots. A mass
+        Elimination without pivoting requires a positive definite M. With constraints M may be singular, and is then
+        augmented by GᵀG. Both choices give right answers: a wrong guess is detected by the test on the pivots. A mass
         matrix that is a series in something small, as 1/(c² r) in relativity, is positive definite where that is small:
-        a scene counts as positive definite that is so at all states near, or at all far away.
+        so a scene counts as positive definite if it is at all states near the origin, or at all far away.
         """
         for reach in (1.0, _FAR):
             if (regular := self._judge_regularity(self.samples(reach), self._row_count(saddle))) is not None:
@@ -378,7 +382,7 @@ class Accelerations:
         return None if samples is None else self._judge_regularity(samples, self._row_count(saddle))
 
     def _judge_regularity(self, samples: "list[tuple[_MatrixEntries, _MatrixEntries]]", m: int) -> bool | None:
-        """True if M is regular at some states; None where it is not positive definite, on m rows of G at rest."""
+        """True if M is regular at some states, else False; None if not positive definite where m rows of G vanish."""
         regular = True
         for matrix, jacobian in samples:
             size = np.abs(matrix.values).max(initial=0.0)
@@ -392,7 +396,7 @@ class Accelerations:
 
     @functools.cached_property
     def depend_on_params(self) -> bool:
-        """True if nothing pivots, and parameters decide whether M is positive definite."""
+        """True if elimination does not pivot, and parameters decide whether M is positive definite."""
         try:
             settled = self._mass_pivots or self._is_mass_regular(_ACCELERATION) is not None
             return not settled and self._favorable_params is not None
@@ -400,7 +404,7 @@ class Accelerations:
             return False
 
     def suit(self, numbers: np.ndarray) -> bool:
-        """True if M is positive definite with these parameters, at all sampled states near or at all far away."""
+        """True if M is positive definite for these parameters, at all sampled states near the origin or far away."""
         rows = self._row_count(_ACCELERATION)
         return any(self._judge_regularity(self.samples(reach, numbers), rows) is not None for reach in (1.0, _FAR))
 
@@ -410,10 +414,10 @@ class Accelerations:
 
     @functools.cached_property
     def _favorable_params(self) -> np.ndarray | None:
-        """Numbers of params, none negative, that make M, with GᵀG, positive definite; None where none are found.
+        """Nonnegative parameters for which M, augmented by GᵀG, is positive definite; None if none are found.
 
-        From those of the samples it is climbed along the slopes of what is negative in M: couplings, which are numbers
-        of their own, fall to zero.
+        From sampled parameters the most negative eigenvalue of M is increased along its gradient: parameters that
+        couple coordinates fall to zero.
         """
         first = 2 * self.layout.size + 1
         program, columns = self.of.program("mass_matrix", "jacobian"), [x[:1] for x in self._input_columns()]

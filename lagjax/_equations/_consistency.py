@@ -1,18 +1,19 @@
 """The test that the start of a motion satisfies its constraints, before any work is done.
 
-What a start is measured by, and how far off it may be, stands in `_constraints`. Here it is evaluated with the user's
-own arguments, and answered with a sentence. Values that are being traced, as under `jax.jit`, are not looked at.
+The measures and tolerances are those of `_constraints`. Here they are evaluated with the user's own arguments, and
+violations become error sentences. Traced values, as under `jax.jit`, are not tested.
 """
 
 import dataclasses
 import functools
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._equations._constraints import ROUNDINGS, TOLERANCE, is_inconsistent, rows_of_terms, sizes
 from lagjax._equations._derivation import derivation_of
@@ -21,17 +22,15 @@ from lagjax._equations._many_states import Sample
 from lagjax._interface import Layout, is_concrete
 from lagjax._primitives import accepts_singles
 
-PyTree = Any
-
 
 @accepts_singles(("q0", "qdot0"), ("ts", "params"))
 def require_consistent(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> None:
-    """Raise `ValueError`, naming the constraint, where the start of a single motion is inconsistent.
+    """Raise `ValueError`, naming the constraint, if the start of a single motion is inconsistent.
 
     That is: a constraint is not finite, or has no gradient; as many are independent as there are coordinates, so that
     nothing can move; two of them contradict each other; or q0 or qdot0 is farther from one than `TOLERANCE` of its
-    size, and the value of the constraint is more than `ROUNDINGS` of its own terms. What depends on which is not asked
-    in a large scene, where steps that do not arrive at the constraints end the motion.
+    size, and the value of the constraint is more than `ROUNDINGS` of its own terms. Dependences between constraints are
+    not tested in a large scene, where steps that do not arrive at the constraints end the motion.
     """
     if not has_constraints(system) or not all(map(is_concrete, jax.tree.leaves((ts, q0, qdot0, params, system)))):
         return
@@ -57,7 +56,7 @@ def require_consistent(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, pa
 
 
 def _start_faults(names, start, dependent, tolerance, rounding) -> Iterator[tuple[bool, str]]:
-    """Sentences for contradictions (True: of positions) and distances beyond `rounding` (3, m) of values, rates, γ."""
+    """Pairs (is a contradiction of positions, sentence) for faults beyond `rounding` (3, m) of values, rates and γ."""
     of_rows = (
         (start.values, start.size_q, "q0", "it"),
         (start.rates, start.size_qdot, "qdot0", "its rate of change"),
@@ -77,7 +76,7 @@ def _start_faults(names, start, dependent, tolerance, rounding) -> Iterator[tupl
 
 
 class _StartConditions(NamedTuple):
-    """The conditions of m constraints on the first state of a motion of n coordinates, in NumPy."""
+    """The residuals and sizes of m constraints at the first state of a motion with n coordinates, in NumPy."""
 
     values: np.ndarray  # f, and zero for constraints on velocities, (m,)
     rates: np.ndarray  # J q̇ + ∂f/∂t, then a, (m,)
@@ -113,7 +112,7 @@ def _require_gradients(names: list[str], start: _StartConditions) -> None:
 
 
 def _require_room(names: list[str], start: _StartConditions, coordinates: int, independent: int) -> None:
-    """Raise where independent constraints, more than there are coordinates, leave nothing to move."""
+    """Raise if as many constraints are independent as there are coordinates, so that nothing can move."""
     if len(names) > coordinates <= independent and start.schur is not None and np.isfinite(start.schur).all():
         raise ValueError(
             f"There are {len(names)} constraints ({', '.join(names)}) for {coordinates} coordinates, and {independent} "
@@ -122,7 +121,7 @@ def _require_room(names: list[str], start: _StartConditions, coordinates: int, i
 
 
 def _contradiction(names, values, what, lengths, dependent, tolerance, size, rounding) -> str | None:
-    """A sentence where a constraint is a combination of others, but asks for another combination of `values` (m,)."""
+    """A sentence if a constraint is a combination of others, but its value is not that combination of `values` (m,)."""
     # Errors of the quantity `what` count by `size`, or by the largest of `values`, of which `rounding` (m,) may be
     # left.
     size = max(size, np.max(np.abs(values) / lengths))
@@ -140,7 +139,7 @@ def _contradiction(names, values, what, lengths, dependent, tolerance, size, rou
 
 @accepts_singles(("values",), ("ts",))
 def inconsistent_members(system, layout: Layout, ts, values: dict, axes: dict) -> jax.Array | None:
-    """True for each member of a batch that starts off its constraints, shape (N,); None if that cannot be known."""
+    """For each member of a batch: True if it starts off its constraints, (N,); None if that cannot be known."""
     # `values` holds q0, qdot0 and params of the batch, `axes` which axis of each counts the members.
     if not has_constraints(system) or not all(map(is_concrete, jax.tree.leaves((ts, values, system)))):
         return None
@@ -167,7 +166,7 @@ def _inconsistent(has_terms: bool, system, dtype, t, span, q0: PyTree, qdot0: Py
 
 
 def _measure_start(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> _StartConditions:
-    """The start of a motion, measured without compiling anything where the scene has programs."""
+    """The conditions at the start of a motion; nothing is compiled if the scene has programs."""
     layout = dataclasses.replace(layout, dtype=Layout.from_state(q0, qdot0).dtype)  # in float64 also for float32
     q, qdot = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(x)]) for x in (q0, qdot0))
     q, qdot, t = (np.asarray(x, layout.dtype) for x in (q, qdot, ts[0]))

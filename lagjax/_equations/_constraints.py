@@ -1,4 +1,4 @@
-"""Constraints in flat coordinates: their equations, the distance of a state from them, and the way back to them.
+"""Constraints in flat coordinates: their equations, the distance of a state from them, and the projection onto them.
 
 A scene has k constraints on positions and m − k on velocities, of n coordinates:
 
@@ -9,8 +9,8 @@ Both are differentiated by the time until the acceleration appears linearly, f t
     J q̇ + ∂f/∂t = 0,  J = ∂f/∂q                      the rate of f
     G q̈ = γ,          G = (J; ∂a/∂q̇), shape (m, n)   the constraint Jacobian and the acceleration-level right-hand side
 
-A scene without constraints has m = 0 rows here, not another kind of object. Nothing here knows a
-Lagrangian: the mass matrix M, by which distances between states are measured, is an argument.
+A scene without constraints has m = 0 rows here, not a different kind of object. This file does not use the Lagrangian:
+the mass matrix M, by which distances between states are measured, is an argument.
 """
 
 import math
@@ -21,9 +21,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
-PyTree = Any
 Vector = Float[Array, " n"]  # one number for each coordinate
 Row = Float[Array, " m"]  # one number for each constraint
 Time = Float[Array, ""]
@@ -33,9 +32,9 @@ class Constraints(eqx.Module):
     """The constraint functions of a scene: f(q, t, params) → (k,) and a(q, qdot, t, params) → (m − k,), or None.
 
     q and qdot have shape (n,). Every result lists the constraints on positions first. `held(params)` (m,) is 1 for each
-    row that holds and 0 for one that is released, as of contacts: its value, its rows of G and γ and its multiplier are
-    then zero. `drag(q, qdot, t, params)` (n, m) is the force that comes with each multiplier beside Gᵀλ, as friction
-    does. It `turns` where that has the direction of a velocity in space.
+    row that is active and 0 for one that is released, as an open contact: its value, its rows of G and γ and its
+    multiplier are then zero. `drag(q, qdot, t, params)` (n, m) is the force, in addition to Gᵀλ, that each multiplier
+    causes, as friction does. `turns`: that force has the direction of a velocity in space.
     """
 
     on_positions: Callable | None = None
@@ -56,25 +55,25 @@ class Constraints(eqx.Module):
         return jnp.zeros(0, q.dtype) if self.on_velocities is None else self.on_velocities(q, qdot, t, params)
 
     def residual(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Row:
-        """f, then a: zero where the constraints hold."""
+        """The values f, then a: zero where the constraints are satisfied."""
         return jnp.concatenate([self.f(q, t, params), self.a(q, qdot, t, params)])
 
     def rates(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Row:
-        """J q̇ + ∂f/∂t, then a: zero where the velocities are consistent."""
+        """The rates J q̇ + ∂f/∂t, then a: zero where the velocities are consistent."""
         rate = jax.jvp(lambda q, t: self.f(q, t, params), (q, t), (qdot, jnp.ones_like(t)))[1]
         return jnp.concatenate([rate, self.a(q, qdot, t, params)])
 
     def driving(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Row:
-        """∂f/∂t, then a(q, 0, t): a constraint does no work where its driving is zero."""
+        """The driving terms ∂f/∂t, then a(q, 0, t): a constraint does no work where its driving is zero."""
         by_t = jax.jvp(lambda t: self.f(q, t, params), (t,), (jnp.ones_like(t),))[1]
         return jnp.concatenate([by_t, self.a(q, jnp.zeros_like(qdot), t, params)])
 
     def jacobian(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Float[Array, "m n"]:
-        """G = (J; ∂a/∂q̇)."""
+        """The constraint Jacobian G = (J; ∂a/∂q̇)."""
         return jnp.concatenate([jax.jacfwd(self.f)(q, t, params), jax.jacfwd(self.a, argnums=1)(q, qdot, t, params)])
 
     def gamma(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Row:
-        """γ of G q̈ = γ: minus all that the time derivatives of f and a contain besides G q̈."""
+        """The right-hand side γ of G q̈ = γ: minus all terms of the time derivatives of f and a other than G q̈."""
         forward = qdot, jnp.ones_like(t)
 
         def rate(function):
@@ -84,7 +83,7 @@ class Constraints(eqx.Module):
         return -jnp.concatenate([of(q, t) for of in rates])
 
     def products(self, q: Vector, qdot: Vector, t: Time, params: PyTree, positions=False) -> tuple[Callable, Callable]:
-        """x ↦ G x and λ ↦ Gᵀλ, of the constraints on `positions` alone where that is True."""
+        """The functions x ↦ G x and λ ↦ Gᵀλ; with `positions`, of the constraints on positions only."""
         if positions:
             _, push = jax.linearize(lambda q: self.f(q, t, params), q)
         else:
@@ -112,11 +111,11 @@ ROUNDINGS = 40
 
 
 def is_inconsistent(motion, state: tuple, span, dtype, terms) -> Bool[Array, ""]:
-    """True if no motion over this span of time may start from a state: off a constraint, or one has no gradient.
+    """True if no motion over this time span may start from a state: it violates a constraint, or one has no gradient.
 
-    Off is what is farther than `TOLERANCE` of the size of the state and has a value of more than `ROUNDINGS` of the
-    `terms` (2m,) of `residual` and of `rates` (see `Derivation.term_sizes`), in a start of this dtype. A state that is
-    not a number is inconsistent.
+    It violates one if it is farther away than `TOLERANCE` of the size of the state, and the value is more than
+    `ROUNDINGS` of the `terms` (2m,) of `residual` and of `rates` (see `Derivation.term_sizes`), in a start of this
+    dtype. A state that is not a number is inconsistent.
     """
     (q, qdot, t, params), of, unit = state, motion.constraints, motion.unit(*state)
     values, lengths = jnp.stack([of.residual(*state), of.rates(*state)]), motion.row_lengths(unit, *state)
@@ -127,17 +126,16 @@ def is_inconsistent(motion, state: tuple, span, dtype, terms) -> Bool[Array, ""]
 
 
 def exceeds(left: Row, lengths: Row, terms, unit: Vector, *accelerations: Vector) -> Bool[Array, " m"]:
-    """True where what is `left` of G q̈ − γ (m,) is beyond `TOLERANCE` of accelerations (n,) and rounding of `terms`."""
+    """For each constraint: the residual `left` of G q̈ − γ (m,) exceeds `TOLERANCE` and the rounding of its `terms`."""
     dtype = np.dtype(left.dtype)
     rounding = ROUNDINGS * np.finfo(dtype).eps * rows_of_terms(terms, left.shape)
     return left > jnp.maximum(TOLERANCE[dtype] * lengths * _size(unit, *accelerations), rounding)
 
 
 def sizes(unit, q, qdot, span):
-    """The sizes of q and of q̇, (…) each, with coordinates in their `unit` (…, n), 1/√Mᵢᵢ: the same for all of them.
+    """The sizes of q and of q̇, (…) each: the largest coordinate in its `unit` (…, n), 1/√Mᵢᵢ.
 
-    Velocities that would not move q by more than its size in the whole span of time are as large as those that would.
-    Takes q and qdot (…, n) of NumPy or JAX.
+    The size of the velocities is at least that of q divided by the time span. Takes q and qdot (…, n) of NumPy or JAX.
     """
     xp = unit.__array_namespace__()
     of_q, of_qdot = (xp.max(xp.abs(x / unit), axis=-1) for x in (q, qdot))
@@ -145,12 +143,12 @@ def sizes(unit, q, qdot, span):
 
 
 def distances(residual, rates, lengths, positions: int):
-    """The errors of positions and velocities in each constraint, two arrays (..., m).
+    """The distances of positions and velocities from each constraint, two arrays (..., m).
 
-    |fₖ|/|∂fₖ/∂q| has the units of a coordinate, which fₖ has not: it is, to first order, how far q has to move. The
-    rates divided by the same `lengths` of the rows of G are, likewise, velocities. Constraints on velocities ask
-    nothing of q. Takes arrays (..., m) of NumPy or JAX; the first `positions` of the m are f. A constraint that holds
-    is at distance zero, also where it has no gradient; otherwise that is infinitely far.
+    The ratio |fₖ|/|∂fₖ/∂q| has the units of a coordinate, which fₖ has not: to first order q has to move so far. The
+    rates divided by the same `lengths` of the rows of G are, likewise, velocities. Constraints on velocities do not
+    restrict q. Takes arrays (..., m) of NumPy or JAX; the first `positions` of the m are f. A satisfied constraint is
+    at distance zero, even without a gradient; otherwise that is infinity.
     """
     xp = lengths.__array_namespace__()
     of_positions = xp.where(xp.arange(residual.shape[-1]) < positions, residual, 0)
@@ -159,19 +157,19 @@ def distances(residual, rates, lengths, positions: int):
 
 
 def rows_of_terms(terms, shape: tuple[int, ...]):
-    """The sizes of the terms of some quantities of m constraints, (…, m); of a scene without programs they are 0."""
+    """The sizes of the terms of some quantities of m constraints, (…, m); 0 for a scene without programs."""
     xp = np if isinstance(terms, float | np.ndarray) else jnp
     return xp.reshape(xp.broadcast_to(terms, math.prod(shape)), shape)
 
 
 def velocity_scales(diagonal: Vector, jacobian: Float[Array, "m k"], qdot: Vector, touched: np.ndarray) -> Vector:
-    """The velocity scales (k,) of the `touched` coordinates for an error norm: how fast others make them move by G.
+    """The velocity scales (k,) of the `touched` coordinates for an error norm: the speeds that others cause through G.
 
-    In constraint k, coordinate j contributes Gₖⱼ q̇ⱼ, which is as large as the velocity |Gₖⱼ q̇ⱼ / Gₖᵢ| of coordinate i;
-    the largest over j is the scale that k gives to i, and the smallest over k counts. So a coupler that does not turn
-    is as exact as the cranks that carry it, and not relative to its own velocity, which is rounding. Where Gₖᵢ happens
-    to pass through zero that grows without bound; it is therefore limited by maxⱼ √(Mⱼⱼ/Mᵢᵢ) |q̇ⱼ|, the velocity of
-    equal kinetic energy. Zero for coordinates in no constraint. `diagonal` (n,) is that of M.
+    In constraint k, coordinate j contributes Gₖⱼ q̇ⱼ, which corresponds to the velocity |Gₖⱼ q̇ⱼ / Gₖᵢ| of coordinate
+    i; the largest over j is the scale that k gives to i, and the smallest over k counts. So a coupler that does not
+    turn is as exact as the cranks that carry it, and not relative to its own velocity, which is rounding. Where Gₖᵢ
+    happens to pass through zero that grows without bound; it is therefore limited by maxⱼ √(Mⱼⱼ/Mᵢᵢ) |q̇ⱼ|, the
+    velocity of equal kinetic energy. Zero for coordinates in no constraint. `diagonal` (n,) is that of M.
     """
     by_constraints = jnp.min(_largest_term(jacobian * qdot[touched], jacobian), axis=0)
     root = jnp.sqrt(jnp.abs(diagonal))[None]
@@ -180,7 +178,7 @@ def velocity_scales(diagonal: Vector, jacobian: Float[Array, "m k"], qdot: Vecto
 
 
 def _largest_term(terms, weights):
-    """max over j of |termsₖⱼ| divided by |weightsₖᵢ|, shape (m, n); infinite where a weight is zero."""
+    """The maximum over j of |termsₖⱼ|, divided by |weightsₖᵢ|, shape (m, n); infinite where a weight is zero."""
     nonzero = weights != 0
     largest = jnp.max(jnp.abs(terms), axis=1, keepdims=True)
     return jnp.where(nonzero, largest / jnp.abs(jnp.where(nonzero, weights, 1.0)), jnp.inf)
@@ -214,18 +212,19 @@ def nearest_consistent(motion, q: Vector, qdot: Vector, t: Time, params: PyTree,
 
 
 def _nearest_positions(motion: Any, q0, qdot, t, params, terms) -> Vector:
-    """q with f = 0, nearest to q0 in the metric of M(q0, q̇), by Newton's method for M (q − q0) + Jᵀν = 0, f = 0.
+    """The q with f = 0 nearest to q0 in the metric of M(q0, q̇), by Newton's method for M (q − q0) + Jᵀν = 0, f = 0.
 
     These are the conditions of the constrained minimum (sequential quadratic programming: Nocedal & Wright, *Numerical
-    Optimization*, §18.1). The method starts where shortest steps to f = 0 alone arrive, for far away its own steps lead
-    anywhere. NaN where either does not arrive, or where the second arrives farther away: at another stationary point.
+    Optimization*, §18.1). The method starts where shortest steps to f = 0 alone converge, since its own steps diverge
+    far away. NaN where either does not converge, or where the second converges farther away: at another stationary
+    point.
 
     The loop is written here and its derivative is `jax.lax.custom_root`'s. `optimistix.root_find` with its `Newton`, an
     own solver for `lineax` (theirs call LAPACK, see `_linear`) and `ImplicitAdjoint` was measured instead. Its
     derivatives are right to every order, but it loses three things. A member of a batch that has no nearest state makes
-    the derivative of the whole batch raise, from a call back to the host: lineax solves for tangents with
-    `throw=True`. Its test of convergence compares f and M (q − q0) with the tolerance for q: masses of 1e6 do not
-    converge. And from some 44 radii beside a circle it does not arrive, without the first loop.
+    the derivative of the whole batch raise, from a call back to the host: lineax solves for tangents with `throw=True`.
+    Its test of convergence compares f and M (q − q0) with the tolerance for q: masses of 1e6 do not converge. And from
+    44 radii outside a circle it does not converge without the first loop.
     """
     constraints, start = motion.constraints, (q0, qdot, t, params)
     multiply = motion.mass_product(*start)
@@ -277,7 +276,7 @@ def _nearest_positions(motion: Any, q0, qdot, t, params, terms) -> Vector:
 
 
 def _iterate_to_rest(step: Callable, start: tuple[Vector, Row], is_at_rest: Callable) -> tuple[Vector, Row]:
-    """(q, ν) after as many steps as it takes until q moves no more than rounding; NaN if it always does."""
+    """Repeat `step` on (q, ν) until q moves no more than rounding; q is NaN if it does not converge."""
 
     def moves(carry):
         (q, _), moved, count = carry
@@ -293,13 +292,13 @@ def _iterate_to_rest(step: Callable, start: tuple[Vector, Row], is_at_rest: Call
 
 
 def _constraints_hold(residual: Row, lengths: Row, terms: Row, unit: Vector, *states: Vector) -> Bool[Array, ""]:
-    """True if constraints hold, in which case the steps did not just become small between some that contradict.
+    """True if the constraints are satisfied, as opposed to small steps between constraints that contradict each other.
 
     A distance of √eps of the state is allowed: the last step of Newton's method was at the level of rounding, so that
     constraints which can hold do so far better, and those that contradict each other are off by far more. The second
-    term is for a gradient that vanishes, where rounding of the others' size is the limit. Coordinates
-    are in their `unit` (n,), and so are the `lengths` (m,) of the rows of G, and as large as in any of the states (n,).
-    Rounding of `terms` (m,) is allowed as well.
+    term is for a gradient that vanishes, where rounding of the others' size is the limit. Coordinates are in their
+    `unit` (n,), and so are the `lengths` (m,) of the rows of G, and as large as in any of the states (n,). Rounding of
+    `terms` (m,) is allowed as well.
     """
     eps = jnp.finfo(residual.dtype).eps
     allowed = jnp.sqrt(eps) * lengths + 100 * eps * jnp.max(lengths)

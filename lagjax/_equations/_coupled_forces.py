@@ -1,14 +1,14 @@
-"""Forces that read the multipliers of the constraints, as dry friction on a wire or in a bearing does: Q(q, q̇, t, λ).
+"""Forces that depend on the multipliers of the constraints, such as dry friction on a wire: Q(q, q̇, t, λ).
 
 M q̈ = F + Q + Gᵀλ and G q̈ = γ make the multipliers linear in the force, and with that Q is a function of the state:
 
     λ = λ₀ + R Q(λ),    R = −S⁻¹ G K⁻¹,    S = G K⁻¹ Gᵀ,    K = M + Gᵀ W G        (see `_linear` for W)
 
-What is linear in λ is solved at once. So is what is linear in pieces of a single multiplier that meet at zero, as μ|λ|:
-as long as R Q grows more slowly than λ, the piece is that of λ₀, and none depends on the direction in which friction
-acts. Else, as for the length √(λ₁² + λ₂²) of a bearing's force, and for min(μ|λ|, Q₁), that is a few steps of Newton's
-method, the number of which is bounded and the last of which is tested. Where none is found, or a single multiplier has
-two (Painlevé's paradox), Q is NaN.
+A force linear in λ needs one linear solve. So does one that is piecewise linear in a single multiplier with a kink at
+zero, as μ|λ|: as long as R Q grows more slowly than λ, the piece is that of λ₀, and none depends on the direction in
+which friction acts. Otherwise, as for the length √(λ₁² + λ₂²) of a bearing's force, and for min(μ|λ|, Q₁), a bounded
+number of Newton steps is taken, and the last is tested. If no solution is found, or a single multiplier has two
+(Painlevé's paradox), Q is NaN.
 """
 
 import dataclasses
@@ -20,11 +20,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.interpreters.partial_eval import dce_jaxpr
+from jaxtyping import PyTree
 
 from lagjax._program import Unlowerable
 from lagjax._tracing import lower
-
-PyTree = Any
 
 # Steps of Newton's method. Each squares what is missing, times the part of λ that the force makes: from a tenth the
 # fourth is exact, from nine tenths the seventh; series of the motion converge alike. Pieces are known after one or two.
@@ -33,7 +32,7 @@ _NONE = 1e-30  # of a multiplier's square: nothing pushes
 
 
 class CoupledForces(eqx.Module):
-    """Q(q, qdot, t, params) (n,) for the multipliers that it brings about with the `free` motion, without it.
+    """The force Q(q, qdot, t, params) (n,) with the multipliers that it causes in the motion `free` of it.
 
     `law(q, qdot, t, params, multipliers)` takes these as an array (m,).
     """
@@ -47,7 +46,7 @@ class CoupledForces(eqx.Module):
         return self.solve(matrix, force, of.constraints.jacobian(*state), of.constraints.gamma(*state), *state)
 
     def solve(self, matrix, force, jacobian, gamma, *state):
-        """Q from M, F, G and γ of the free motion."""
+        """The force Q, from M, F, G and γ of the free motion."""
         squares, held = jnp.sum(jacobian**2, axis=1), self.free.constraints.held
         released = None if held is None else 1.0 - held(state[-1])  # rows of G that are zero, with no multiplier
         weights = jnp.trace(matrix) / (squares if released is None else squares + released)
@@ -64,10 +63,10 @@ class CoupledForces(eqx.Module):
 
 
 def couple_forces(motion, law: Callable, layout, params: PyTree):
-    """The motion with forces by a `law` as of `CoupledForces`, of all multipliers.
+    """The motion with forces by a `law` as in `CoupledForces`, of all multipliers.
 
-    Where rows may be released, as those of contacts, and the law is linear in multipliers, what each brings is a
-    `drag`: one linear system, which leaves out rows that depend on others.
+    If rows may be released, as those of contacts, and the law is linear in the multipliers, the force of each is a
+    column of `drag`: one linear system, which leaves out rows that depend on others.
     """
     constraints = motion.constraints
     rest, numbers = jnp.zeros(layout.size, layout.dtype), eqx.filter(params, eqx.is_array_like)
@@ -97,9 +96,9 @@ def couple_forces(motion, law: Callable, layout, params: PyTree):
 
 
 def _solve_law(of_read: Callable, alone, responses, at_zero: bool):
-    """Q(λ) with λ = λ₀ + R Q(λ), for λ₀ (m,) and R (m, n) of multipliers that are read.
+    """The force Q(λ) with λ = λ₀ + R Q(λ), for λ₀ (m,) and R (m, n) of the multipliers that the law reads.
 
-    `at_zero` says that it is one of which all pieces meet at zero.
+    `at_zero`: all kinks of the law are at zero.
     """
     decisive, curved = _slopes_depend_on_multipliers(of_read, alone)
     zero, unit, count = jnp.zeros_like(alone), jnp.eye(len(alone), dtype=alone.dtype), len(alone)
@@ -123,10 +122,7 @@ def _solve_law(of_read: Callable, alone, responses, at_zero: bool):
 
 
 def _find_multipliers_read(law: Callable, *arguments) -> tuple[list[int], bool]:
-    """The places of the multipliers, the last argument of a law, that it reads; all where it has no program.
-
-    And whether it is one of which all pieces meet where that is zero.
-    """
+    """The indices of the multipliers that a law reads (all if it has no program), and a flag: its kinks are at zero."""
     m, inputs = arguments[-1].size, sum(jnp.size(x) for x in jax.tree.leaves(arguments))
     try:
         program = lower(law, *arguments)
@@ -145,7 +141,7 @@ def _find_multipliers_read(law: Callable, *arguments) -> tuple[list[int], bool]:
 
 
 def _slopes_depend_on_multipliers(law: Callable, multipliers) -> tuple[bool, bool]:
-    """True if the slopes of a law by its multipliers depend on these; and if they do so but for their pieces."""
+    """Two flags: the slopes of a law by its multipliers depend on these; they do so within a piece."""
 
     def slopes(some):
         return jax.jacfwd(law)(some)
@@ -160,7 +156,7 @@ def _find_inputs_read(function: Callable, *arguments) -> list[bool]:
 
 
 def eliminate(matrix, right):
-    """X (n, k) of A X = B by elimination without a choice of pivots, which would be a border of the motion."""
+    """X (n, k) with A X = B, by elimination without pivoting, since a choice of pivots would be a border."""
     rows = []
     while len(matrix):
         factors = matrix[1:, 0] / matrix[0, 0]

@@ -3,8 +3,8 @@
     (system, layout, structure of params) ─► derivation_of ─► Derivation ─► programs and facts
 
 One lowering gives all quantities of a state together: L, p, M, the forces, G, γ, … (`Motion.quantities`); a program for
-some of them is cut out of that one. What is solved for (accelerations, multipliers, the steps back to the constraints)
-is lowered once more, from formulas that call these programs (`Accelerations`).
+some of them is cut out of that one. Solutions of linear systems (accelerations, multipliers, the steps back to the
+constraints) are lowered separately, from formulas that call these programs (`Accelerations`).
 
 All programs take the same inputs: q, q̇, t and then every number of params, one scalar each.
 """
@@ -18,6 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._equations import _form as forms
 from lagjax._equations._accelerations import Accelerations, lowered_once
@@ -25,7 +26,7 @@ from lagjax._equations._blame import pieces_of
 from lagjax._equations._coupled_forces import CoupledForces
 from lagjax._equations._form import SCALAR, Form, derived_form, form_in_xla
 from lagjax._equations._motion import Motion
-from lagjax._equations._patterns import gradient_memory, jacobian_pattern
+from lagjax._equations._patterns import count_equations, gradient_memory, jacobian_pattern
 from lagjax._equations._quantities import OwnRules, quantities, unbalanced_force
 from lagjax._equations._recursion import Recursion
 from lagjax._equations._sparse import MOST_COLORS
@@ -35,14 +36,12 @@ from lagjax._primitives import DOUBLE
 from lagjax._program import Borders, Unlowerable, borders, lack_of_memory
 from lagjax._tracing import Program, lower, lower_scalars
 
-PyTree = Any
-
 
 class Derivation:
-    """The derivation of a scene: its programs, and the facts that can be read off them.
+    """The derivation of a scene: its scalar programs, and properties of the scene that they determine.
 
-    Every program is lowered on first use. Each raises `Unlowerable`, with the end of a sentence, where the scene has
-    none: it is too large, or takes operations that have no scalar form.
+    Every program is lowered on first use. Each raises `Unlowerable`, with the end of a sentence, if the scene has none:
+    it is too large, or uses operations without a scalar form.
     """
 
     def __init__(
@@ -55,11 +54,11 @@ class Derivation:
         path: str = "auto",
         counts_on_params: bool = False,
     ):
-        """`params` holds numbers or shapes of numbers; `refusal` says why a scene must not be lowered at all.
+        """`params` has numbers or shapes of numbers; `refusal` is a reason not to lower the scene at all.
 
-        `unhashable` says why this derivation cannot be kept for the next time. On the `path` "auto" a large scene with
-        sparse matrices, whose functions are smooth, is not lowered: its motion is a `SparseMotion`. One that
-        `counts_on_params` takes M for positive definite where some parameters make it so (`with_numbers`).
+        `unhashable` is the reason why this derivation cannot be cached. On the `path` "auto" a large scene with sparse
+        matrices, whose functions are smooth, is not lowered: its motion is a `SparseMotion`. With `counts_on_params` M
+        is taken to be positive definite if it is so for some parameters (`with_numbers`).
         """
         self.motion, self.layout, self.unhashable = motion, layout, unhashable
         self.numbers = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), params)
@@ -87,7 +86,7 @@ class Derivation:
             self.form, self.motion = form, SparseMotion(*vars(motion).values(), structure=form.structure)
 
     def _is_sparse_in_scalars(self) -> bool:
-        """True if the scene has scalar programs, and a mass matrix of few entries there."""
+        """True if the scene has scalar programs in which the rows of the mass matrix have few entries."""
         try:
             return bool((~self.absent("mass_matrix")).sum(axis=1).max() <= MOST_COLORS)
         except Unlowerable:
@@ -95,7 +94,7 @@ class Derivation:
 
     @functools.cached_property
     def lowered(self) -> "Derivation":
-        """This derivation on scalars: itself, or for a large scene one that refuses beyond `LARGEST_LOWERED`."""
+        """This derivation on scalars: itself, or for a large sparse scene a new one, up to `LARGEST_LOWERED`."""
         if not self.form.is_sparse:
             return self
         motion = Motion(*list(vars(self.motion).values())[:4])
@@ -105,10 +104,10 @@ class Derivation:
         return Derivation(motion, self.layout, self.numbers, refusal, self.unhashable, "scalar", self.counts_on_params)
 
     def with_numbers(self, numbers=None) -> "Derivation":
-        """The derivation to use with these numbers of params; None and traced numbers are unknown.
+        """The derivation to use with these parameters; None and traced numbers are unknown.
 
-        If nothing pivots, and params decide whether M is positive definite, it is one that assumes so, unless known
-        numbers contradict it.
+        If elimination does not pivot and parameters decide whether M is positive definite, it is one that assumes so,
+        unless known numbers contradict it.
         """
         doubted = self._assuming_definite_mass
         known = doubted is not None and numbers is not None and is_concrete(numbers)
@@ -116,24 +115,24 @@ class Derivation:
 
     @functools.cached_property
     def _assuming_definite_mass(self) -> "Derivation | None":
-        """The derivation that counts on a positive definite M, where this one does not and needs to."""
+        """The derivation that assumes a positive definite M, if this one does not and needs to; else None."""
         if self.path == "array" or not self.accelerations.depend_on_params:
             return None
         return Derivation(self.motion, self.layout, self.numbers, self.form.reason, self.unhashable, self.path, True)
 
     @functools.cached_property
     def accelerations(self) -> Accelerations:
-        """The programs of all that is solved for."""
+        """The programs that solve linear systems."""
         return Accelerations(self)
 
     @functools.cached_property
     def form_in_xla(self) -> Form:
-        """The form that XLA compiles; `ValueError` where the path "scalar" is impossible."""
+        """The form that XLA compiles; `ValueError` if the path "scalar" is impossible."""
         return form_in_xla(self)
 
     @property
     def is_lowered(self) -> bool:
-        """True if there are programs of the quantities of a state."""
+        """True if the quantities of a state have scalar programs."""
         try:
             return bool(self.whole.shapes)
         except Unlowerable:
@@ -143,9 +142,9 @@ class Derivation:
 
     @lowered_once
     def whole(self) -> Program:
-        """A zero, and all of `Motion.quantities` in the order of their names, without what is `zero` as it is derived.
+        """The program of a zero, then all of `Motion.quantities` in the order of their names, without structural zeros.
 
-        The matrices of large scenes are zeros but for a few numbers.
+        The matrices of large scenes have few entries.
         """
         if self.form.reason is not None:
             raise Unlowerable(self.form.reason)
@@ -177,7 +176,7 @@ class Derivation:
 
     @lowered_once
     def unbalanced_force(self) -> Program:
-        """`Motion.unbalanced_force`; its last inputs are q̈ (n,)."""
+        """The program of `Motion.unbalanced_force`; its last inputs are q̈ (n,)."""
         if self.form.reason is not None or isinstance(self.motion.forces, CoupledForces):
             raise Unlowerable(self.form.reason or "forces read multipliers")
         shapes, moving = (*self.state_shapes, self.state_shapes[0]), 2 * self.layout.size + 1
@@ -193,12 +192,12 @@ class Derivation:
 
     @property
     def recursion(self) -> Recursion | None:
-        """The recursion by which L builds velocities, if that is shorter."""
+        """The recursion by which L builds velocities, if that takes fewer operations; else None."""
         self.whole  # noqa: B018  (its trace finds it)
         return self._recursion
 
     def program(self, *names: str) -> Program:
-        """The program for these of `Motion.quantities`, end to end, each in C order."""
+        """The program of the named ones of `Motion.quantities`, concatenated, each in C order."""
         if names not in self._programs:
             positions = [k for name in names for k in self.positions(name)]
             self._programs[names] = self.whole.select_outputs(positions)
@@ -210,7 +209,7 @@ class Derivation:
         return dict(zip(self._shapes, ends, strict=False))
 
     def shape(self, name: str) -> tuple[int, ...]:
-        """The shape of one of `Motion.quantities`."""
+        """The shape of the named one of `Motion.quantities`."""
         self.whole  # noqa: B018  (its trace says what the shapes are)
         return self._shapes[name]
 
@@ -218,7 +217,7 @@ class Derivation:
         return int(np.prod(self.shape(name), dtype=int))
 
     def evaluate(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:
-        """Named quantities at S states, each of shape (S, …), in NumPy; `columns` as `Program.evaluate_many` takes."""
+        """Named quantities at S states, each (S, …), in NumPy; `columns` as in `Program.evaluate_many`."""
         return self.split_outputs(names, self.program(*names).evaluate_many(columns).T)
 
     def term_sizes(self, q, qdot, t, numbers: PyTree, names: tuple[str, ...] = ("residual", "rates")):
@@ -240,7 +239,7 @@ class Derivation:
         return self._rounding_of(names, self.program(*names).size)
 
     def round_off(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:
-        """The rounding errors of these quantities at S states that are exact, each of shape (S, …)."""
+        """The rounding errors of these quantities at S exact states, each of shape (S, …)."""
         sizes = self._rounding_of(tuple(names), 0).evaluate_many(columns)
         return self.split_outputs(names, np.finfo(sizes.dtype).eps * sizes.T)
 
@@ -258,7 +257,7 @@ class Derivation:
         return {name: x.reshape(*x.shape[:-1], *self.shape(name)) for name, x in parts.items()}
 
     def momenta_by_q(self, momenta: tuple[int, ...]) -> Program:
-        """∂pᵢ/∂q for the coordinates i in `momenta`, shape (len(momenta), n)."""
+        """The program of ∂pᵢ/∂q for the coordinates i in `momenta`, shape (len(momenta), n)."""
         key = "momenta_by_q", *map(str, momenta)
         if key not in self._programs:
             chosen = jax.jacrev(lambda *state: self._traced_once.momentum(*state)[jnp.asarray(momenta, int)])
@@ -269,57 +268,57 @@ class Derivation:
     # ---- facts ----
 
     def reads(self, name: str) -> frozenset[int]:
-        """The positions of the inputs that any number of this quantity depends on."""
+        """The positions of the inputs on which any entry of this quantity depends."""
         return self.whole.find_inputs(self.filled_positions(name))
 
     def absent(self, name: str) -> np.ndarray:
-        """True for each number of this quantity that is zero whatever the state, in its shape."""
+        """A mask, in the shape of this quantity, of the entries that are structurally zero."""
         absent, line = np.ones(self.count(name), bool), self.whole.line
         of = (line.nodes[line.outputs[k]] for k in self.filled_positions(name))
         absent[self.filled[name]] = [op == "constant" and number == 0 for op, _, number in of]
         return absent.reshape(self.shape(name))
 
     def positions(self, name: str) -> np.ndarray:
-        """The outputs of the program of all quantities that are this one, in C order."""
+        """The output positions, in `whole`, of the entries of this quantity in C order."""
         positions = np.zeros(self.count(name), int)
         positions[self.filled[name]] = self.filled_positions(name)
         return positions
 
     def filled_positions(self, name: str) -> range:
-        """The outputs that are numbers of this quantity which are not zero as they are derived."""
+        """The output positions, in `whole`, of the entries of this quantity that are not structurally zero."""
         self.whole  # noqa: B018  (its trace says where quantities start)
         return range(self._output_starts[name], self._output_starts[name] + len(self.filled[name]))
 
     @lowered_once
     def works(self) -> bool:
-        """True if anything does work: an explicit time, a force, a constraint that drives the motion."""
+        """True if energy is exchanged: L depends on time, or there is a force or a driving constraint."""
         return not all(self.absent(name).all() for name in ("lagrangian_by_t", "nonconservative_force", "driving"))
 
     @lowered_once
     def conserved(self) -> tuple[int, ...]:
-        """The coordinates whose momenta are constant: neither L, nor a force, nor a constraint acts on them."""
+        """The coordinates whose momenta are constant: no term of L, no force and no constraint acts on them."""
         untouched = self.absent("generalized_force") & self.absent("jacobian").all(axis=0)
         return tuple(np.flatnonzero(untouched).tolist())
 
     @functools.cached_property
     def unread(self) -> tuple[int, ...] | None:
-        """The coordinates that no operation of L reads, of a scene on arrays; None where a function hides that."""
+        """The coordinates that no operation of L reads, for a scene on arrays; None if the pattern is unknown."""
         pattern = jacobian_pattern(lambda *state: jnp.ravel(self.motion.lagrangian(*state)), self.state_shapes, by=0)
         return None if pattern is None else tuple(np.flatnonzero(pattern.sum(axis=0) == 0).tolist())
 
     @property
     def cyclic(self) -> tuple[int, ...] | None:
-        """The `unread` coordinates; None also where a look takes long."""
+        """The `unread` coordinates; None also if finding them takes long."""
         return None if self.form.operations > forms.LARGEST_FOLLOWED else self.unread
 
     @lowered_once
     def borders(self) -> Borders | None:
-        """The decisions of the accelerations along a motion, and their narrow features; None where there are none."""
+        """The borders and narrow features of the accelerations; None if they are smooth."""
         return borders(self.accelerations.program, self.layout.size)
 
     @functools.cached_property
     def kicks(self) -> bool:
-        """True if velocities jump at borders of the motion, as L or a speed that a constraint prescribes does."""
+        """True if velocities jump at borders, because L, or a speed prescribed by a constraint, jumps."""
         if not self.motion.constrained and not pieces_of([self.motion.lagrangian], *self.state_shapes):
             return False  # most scenes, and the largest ones, at no cost
         try:
@@ -329,7 +328,7 @@ class Derivation:
 
     @property
     def kick_refusal(self) -> str | None:
-        """Why velocities behind a border are not known, as the end of a sentence; None where they are."""
+        """The reason why velocities behind a border are unknown, as the end of a sentence; None if they are known."""
         if self.kicks and isinstance(self.motion.forces, CoupledForces):
             return "L jumps at a border, and no law gives the impulse of a force that reads multipliers"
         if not self.kicks or (borders := self.borders) is None or borders.kick is None or not borders.kick.refused:
@@ -345,13 +344,12 @@ class Derivation:
 
     @property
     def differentiates(self) -> bool:
-        """True if derivatives are those of programs: no function has rules of its own or looks up a table, and the
-        programs are not large."""
+        """True if JAX differentiates the programs: small ones, without custom rules or table look-ups."""
         return self._may_be_differentiated("whole")
 
     @property
     def differentiates_force(self) -> bool:
-        """True if those of `unbalanced_force` are."""
+        """True if JAX differentiates the program of `unbalanced_force`."""
         return self._may_be_differentiated("unbalanced_force")
 
     def _may_be_differentiated(self, name: str) -> bool:
@@ -360,18 +358,27 @@ class Derivation:
         except Unlowerable:
             return False
         usual = not (program.looks_up or self.has_rules)
-        return usual and self.layout.dtype == DOUBLE and program.operations <= forms.LARGEST_DIFFERENTIATED
+        return usual and self.layout.dtype == DOUBLE and forms.suits_programs(self, program.operations)
+
+    @functools.cached_property
+    def equations(self) -> int:
+        """The equations of JAX that L, forces, dissipation and constraints are written in."""
+        functions = [jax.make_jaxpr(f)(*self.state_shapes) for f in self._traced_once.functions]
+        q, _, t, numbers = self.state_shapes
+        if self.motion.constrained:
+            functions.append(jax.make_jaxpr(self._traced_once.constraints.f)(q, t, numbers))
+        return sum(count_equations(of.jaxpr) for of in functions)
 
     @property
     def traced_operations(self) -> int:
-        """The scalar operations of all quantities as derived, before reduction."""
+        """The number of scalar operations of all quantities before simplification."""
         return self.whole.traced_operations
 
     # ---- inputs ----
 
     @property
     def state_shapes(self) -> tuple:
-        """Shapes of (q, q̇, t, params), as the functions of the motion take them."""
+        """The shapes of (q, q̇, t, params), as the functions of the motion take them."""
         q, t = jax.ShapeDtypeStruct((self.layout.size,), self.layout.dtype), jax.ShapeDtypeStruct((), self.layout.dtype)
         return q, q, t, self.numbers
 
@@ -403,14 +410,14 @@ def numbers_of(params: PyTree) -> list:
 
 
 class _NumberKey(NamedTuple):
-    """The key of a number, or of an array of them, among the parameters."""
+    """The cache key of a number or array among the parameters: its shape and dtype, not its values."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
 
 
 class _SceneStructure(NamedTuple):
-    """All that decides how a scene is derived, structure alone; a leaf of params is a `_NumberKey`, or program."""
+    """The cache key of a scene: all of its structure, without values; a leaf of params is a `_NumberKey` or code."""
 
     system: Any
     layout: Layout
@@ -425,10 +432,10 @@ class _SceneStructure(NamedTuple):
 
 
 def derivation_of(system: Any, layout: Layout, params: PyTree) -> Derivation:
-    """The derivation of a scene with parameters of this structure, whatever their values.
+    """The derivation of a scene for parameters of this structure, whatever their values.
 
-    It is made once for scenes, layouts and structures that are equal. Scenes whose functions hold arrays of their own
-    have no programs, as these arrays could change; those whose code cannot be hashed are derived anew each time.
+    It is made once for equal scenes, layouts and structures. Scenes whose functions hold arrays of their own have no
+    programs, as these arrays could change; those whose code cannot be hashed are derived anew each time.
     """
     key = _structure_key(system, layout, params)
     if key is None:
@@ -443,7 +450,7 @@ def derivation_of(system: Any, layout: Layout, params: PyTree) -> Derivation:
 
 
 def once_for_structure(make: Callable) -> Callable:
-    """`make(system, layout, params)`, which depends on no values, called once for all that `derivation_of` does so."""
+    """A decorator: `make(system, layout, params)`, independent of values, is cached as in `derivation_of`."""
     make_once = functools.lru_cache(maxsize=64)(lambda key: make(*key.restored))
 
     @functools.wraps(make)
@@ -459,7 +466,7 @@ def once_for_structure(make: Callable) -> Callable:
 
 
 def _structure_key(system: Any, layout: Layout, params: PyTree) -> _SceneStructure | None:
-    """All that decides how a scene is derived; None where its functions hold arrays."""
+    """The cache key of a scene with its layout and parameters; None if its functions hold arrays."""
     arrays, scene = jax.tree.flatten(system)
     leaves, tree = jax.tree.flatten(params)
     kept = (

@@ -68,6 +68,11 @@ LARGEST_COMPILED = 100
 # those of arrays 2 s for what is vectorised, as 60 bodies are (39 000: 4 s), and 13 s for an arm that is written joint
 # by joint (7600: 1 s). Doubled, the first kind loses 3 s more; halved, arms of 12 joints compile for half a minute.
 LARGEST_DIFFERENTIATED = 30_000
+# Operations of all quantities, and of these for each equation that JAX writes the scene in, beyond which JAX does so
+# too. Arrays take 1 to 2 s however long they are: the gradient of an acceleration with a network 2 × 32 in L (4600
+# operations, 33 equations) takes 0.8 s, by programs 2.6; of a chain of 32 (4200, 21) 2.2 and 2.6; 24 coordinates joint
+# by joint (15 100, 1846) 3.6 by programs.
+LEAST_AS_ARRAYS, MOST_OF_EQUATION = 3000, 100
 
 # ---- analysis and checks ---------------------------------------------------------------------------------------------
 
@@ -88,7 +93,7 @@ class Form(NamedTuple):
     - `kind`: "scalar", as programs, operation by operation; "arrays", with M and G as matrices; "sparse", by their
       patterns.
     - `reason`: why they are no programs, as the end of a sentence; None where they are.
-    - `structure`: of sparse matrices. `operations`: those of L, or of the program, where they are counted.
+    - `structure`: that of sparse matrices. `operations`: the number in L, or in the program, where they are counted.
     """
 
     kind: Literal["scalar", "arrays", "sparse"]
@@ -102,7 +107,7 @@ class Form(NamedTuple):
 
     @property
     def mass(self) -> MatrixForm | None:
-        """The form of M where it is sparse."""
+        """The form of M if it is sparse, else None."""
         return self.structure and self.structure.mass
 
 
@@ -110,7 +115,7 @@ SCALAR = Form("scalar")
 
 
 def derived_form(motion: Motion, shapes: tuple, path: str, is_sparse_in_scalars: Callable[[], bool]) -> Form:
-    """The form in which a scene is derived, of the shapes of (q, q̇, t, params); sparse if it is large, and suits that.
+    """The form in which a scene is derived, from the shapes of (q, q̇, t, params); sparse if large and suitable.
 
     On the `path` "array" size alone decides. M that is not sparse as arrays may be so on scalars, where zeros cancel.
     """
@@ -135,8 +140,15 @@ def derived_form(motion: Motion, shapes: tuple, path: str, is_sparse_in_scalars:
     return Form("sparse", reason, structure, operations)
 
 
+def suits_programs(derivation: "Derivation", operations: int) -> bool:
+    """True if derivatives are quicker by programs, of this many operations, than by the functions as written."""
+    if operations <= LEAST_AS_ARRAYS or operations > LARGEST_DIFFERENTIATED:
+        return operations <= LEAST_AS_ARRAYS
+    return operations <= MOST_OF_EQUATION * derivation.equations
+
+
 def form_in_xla(derivation: "Derivation") -> Form:
-    """The form of a scene that XLA compiles, by its path; `ValueError` where "scalar" is impossible."""
+    """The form of a scene that XLA compiles, by its path; `ValueError` if "scalar" is impossible."""
     arrays = derivation.form if derivation.form.is_sparse else Form("arrays")
     if derivation.path == "array":
         return arrays._replace(reason="asked for")

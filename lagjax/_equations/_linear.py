@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from lagjax._primitives import start_alike
+from lagjax._primitives import vary_carry_alike
 
 # The numbers of one state, as arrays of JAX or NumPy, and those of S states, as arrays of NumPy.
 Matrix = Float[Array, "n n"]
@@ -35,7 +35,7 @@ Matrices = Float[np.ndarray, "S n n"]
 
 
 class Factorization(eqx.Module):
-    """An inverted symmetric matrix, and whether it is singular to working precision (a NaN in it is not that)."""
+    """An inverted symmetric matrix, and a flag: it is singular to working precision (NaN does not set it)."""
 
     matrix: Matrix
     scale: Vector
@@ -44,7 +44,7 @@ class Factorization(eqx.Module):
     singular: Bool[Array, ""]
 
     def solve(self, b: Vector) -> Vector:
-        """x with M x = b; NaN where M is singular. Differentiated implicitly: one more solve with the same inverse."""
+        """The solution x of M x = b; NaN where M is singular. Its derivative is one more solve with the inverse."""
 
         def times_matrix(y):
             return self.scale * (self.matrix @ (self.scale * y))
@@ -59,7 +59,7 @@ class Factorization(eqx.Module):
         return jnp.where(self.singular, jnp.nan, x)
 
     def solve_columns(self, b: Float[Array, "n k"]) -> Float[Array, "n k"]:
-        """X with M X = B, shape (n, k)."""
+        """The solution X of M X = B, shape (n, k)."""
         return jax.vmap(self.solve, in_axes=1, out_axes=1)(b)
 
 
@@ -72,7 +72,7 @@ def factorize(matrix: Matrix) -> Factorization:
 
 
 def diagonal_scale(matrix):
-    """1/√|Mᵢᵢ| of symmetric matrices (..., n, n), shape (..., n), by which both sides are scaled to a unit diagonal."""
+    """1/√|Mᵢᵢ| of symmetric matrices (..., n, n), shape (..., n): scaling both sides by it gives a unit diagonal."""
     # Where the diagonal is zero it is the row's largest entry that counts, and 1 where the whole row is. For arrays of
     # NumPy or JAX.
     xp = matrix.__array_namespace__()
@@ -88,14 +88,14 @@ def unit_diagonal(matrix):
 
 
 def singular_threshold(n: int, dtype) -> float:
-    """The ratio of the smallest to the largest pivot at which a scaled n × n matrix counts as singular: n eps."""
+    """The ratio of the smallest to the largest pivot below which a scaled n × n matrix counts as singular: n eps."""
     # About so much is left of a pivot that is zero after n subtractions, and a solution has no digit left there. Twice
     # as large, it would refuse matrices whose solution has one binary digit.
     return n * float(jnp.finfo(dtype).eps)
 
 
 def eigen(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ascending eigenvalues (n,) of a symmetric matrix (n, n), and its eigenvectors, one a column (n, n)."""
+    """Ascending eigenvalues (n,) of a symmetric matrix (n, n), and its eigenvectors as columns (n, n)."""
     diagonal = np.diagonal(matrix)
     if not np.array_equal(matrix, np.diag(diagonal)):
         values, vectors = np.linalg.eigh(matrix)
@@ -105,7 +105,7 @@ def eigen(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def null_directions(matrix: np.ndarray, threshold: float | None = None) -> np.ndarray:
-    """Unit vectors (k, n) that a symmetric matrix, scaled to a unit diagonal, sends to zero, up to `threshold`."""
+    """Unit vectors (k, n) in the null space, up to `threshold`, of a symmetric matrix scaled to a unit diagonal."""
     threshold = singular_threshold(len(matrix), matrix.dtype) if threshold is None else threshold
     scaled, scale = unit_diagonal(matrix)
     values, vectors = eigen(scaled)
@@ -146,13 +146,13 @@ def invert(matrix: Matrix) -> tuple[Matrix, Int[Array, " n"], Vector]:
         order = jax.lax.dynamic_update_slice_in_dim(order, panel_order, index * width, 0)
         return panel, left, order, jax.lax.dynamic_update_slice_in_dim(pivots, panel_pivots, index * width, 0)
 
-    start = start_alike((a, jnp.ones(size, bool), jnp.zeros(size, np.int32), jnp.zeros(size, a.dtype)))
+    start = vary_carry_alike((a, jnp.ones(size, bool), jnp.zeros(size, np.int32), jnp.zeros(size, a.dtype)))
     a, _, order, pivots = jax.lax.fori_loop(0, count, one_panel, start) if count > 1 else one_panel(0, start)
     return _permute_rows(a, order[:n])[:, :n], order[:n], pivots[:n]
 
 
 def _eliminate_panel(panel: Array, free: Array) -> tuple[Array, Array, Array, Array]:
-    """A panel of columns (size, width) after elimination, which rows are still free, the pivots' rows, the pivots."""
+    """Eliminate a panel of columns (size, width): the panel, free rows, rows of the pivots, and pivots."""
 
     def one_column(k, carry):
         panel, free, order, pivots = carry
@@ -165,12 +165,12 @@ def _eliminate_panel(panel: Array, free: Array) -> tuple[Array, Array, Array, Ar
         return panel, free & ~this_row, order, pivots
 
     width = panel.shape[1]
-    start = start_alike((panel, free, jnp.zeros(width, np.int32), jnp.zeros(width, panel.dtype)))
+    start = vary_carry_alike((panel, free, jnp.zeros(width, np.int32), jnp.zeros(width, panel.dtype)))
     return jax.lax.fori_loop(0, width, one_column, start)
 
 
 def _pivot_step(a: Array, this_row: Array, this_column: Array) -> tuple[Array, Array]:
-    """The array A after one column was eliminated by one row, each given as a mask, and the pivot between them."""
+    """The array A after one column was eliminated with one row (both given as masks), and the pivot."""
     # Masks and not indices, which become gathers and scatters under `vmap`: masks are faster on the CPU, as measured.
     row = jnp.sum(jnp.where(this_row[:, None], a, 0), axis=0)
     column = jnp.sum(jnp.where(this_column, a, 0), axis=1)
@@ -196,7 +196,7 @@ def _permute_rows(a: Array, order: Int[Array, " n"]) -> Array:
 
 
 def saddle(matrix: Matrix, b: Vector, jacobian: Rows, c: Float[Array, " m"]) -> tuple[Vector, Array, Bool[Array, ""]]:
-    """x (n,), λ (m,) of least norm, and whether the saddle point is singular; `jacobian` is G (m, n)."""
+    """The solution x (n,), λ (m,) of least norm, and a flag: the saddle point is singular; `jacobian` is G (m, n)."""
     augmented, weighted = augment(matrix, jacobian)
     factorization = factorize(augmented)
     free, responses = factorization.solve(b + weighted.T @ c), factorization.solve_columns(jacobian.T)
@@ -205,7 +205,7 @@ def saddle(matrix: Matrix, b: Vector, jacobian: Rows, c: Float[Array, " m"]) -> 
 
 
 def augment(matrix, jacobian):
-    """K = M + GᵀW G (..., n, n) and W G (..., m, n), with weights that make every row of G as heavy as M."""
+    """K = M + GᵀW G (..., n, n) and W G (..., m, n), with weights W that scale every row of G to the size of M."""
     # Wₖ = max|Mᵢᵢ|/|Gₖ|² gives both terms of K the same size, in whatever units a constraint is written: neither drowns
     # the other in rounding. 10ᵈ times larger or smaller, they would cost up to d digits. W has no derivative, as
     # nothing depends on it. For arrays of NumPy or JAX.
@@ -218,10 +218,10 @@ def augment(matrix, jacobian):
 
 
 def dependent_rows(matrix: np.ndarray) -> dict[int, np.ndarray]:
-    """The rows of G that are combinations of rows before them, from the Schur complement S (m, m).
+    """The rows of G that are linear combinations of rows before them, from the Schur complement S (m, m).
 
-    For each its index, and by which factors (m,) it is made of the others. A row is dependent where its part outside of
-    those before it is below `rank_tolerance` of its own size, squared as S is.
+    Maps each such index to the factors (m,) of the combination. A row is dependent if its component outside of those
+    before it is below `rank_tolerance` of its own size, squared as S is.
     """
     independent, dependent = [], {}
     for row in range(len(matrix)):
@@ -240,7 +240,7 @@ def dependent_rows(matrix: np.ndarray) -> dict[int, np.ndarray]:
 
 
 def rank_tolerance(dtype) -> float:
-    """The part of a constraint, scaled to 1, below which it counts as a combination of the others: eps^(2/3)."""
+    """The size, relative to a constraint, below which its independent component counts as zero: eps^(2/3)."""
     # It is compared with pivots of S. One of eps^(2/3) = 4e-11 is 2e5 units of round-off, so that redundant
     # constraints, whose pivots are some units, never count as independent, which would give multipliers of any size. A
     # constraint that differs from the others by less than eps^(1/3) = 6e-6 of its length counts as redundant; with
@@ -249,7 +249,7 @@ def rank_tolerance(dtype) -> float:
 
 
 def least_norm(matrix: Matrix, b: Vector) -> Vector:
-    """The shortest x with S x = b for a symmetric S (m, m), its rank by `rank_tolerance`, and b in its range."""
+    """The shortest x with S x = b for a symmetric S (m, m), of rank by `rank_tolerance`, and b in its range."""
     return _inverse_on_range(matrix) @ b
 
 
@@ -282,7 +282,7 @@ def _inverse_on_range_jvp(primals, tangents):
 
 
 def rank(matrix: Matrix) -> Int[Array, ""]:
-    """The number of independent rows of a symmetric matrix (m, m): `rank_tolerance` decides what counts as zero."""
+    """The number of independent rows of a symmetric matrix (m, m), by `rank_tolerance`."""
     return jnp.sum(_factor_independent(matrix, jnp.ones(len(matrix), matrix.dtype))[2]).astype(int)
 
 
@@ -309,7 +309,7 @@ def _factor_independent(matrix: Matrix, scale: Vector) -> tuple[Matrix, Matrix, 
         a = jnp.where(counts, _pivot_step(a, row, column)[0], a)
         return a, pairs + (row[:, None] & column & counts)
 
-    a, pairs = jax.lax.fori_loop(0, m, one_pivot, start_alike((matrix, jnp.zeros_like(matrix)), scale))
+    a, pairs = jax.lax.fori_loop(0, m, one_pivot, vary_carry_alike((matrix, jnp.zeros_like(matrix)), scale))
     rows, columns = jnp.sum(pairs, axis=1) > 0, jnp.sum(pairs, axis=0) > 0
     inverse = pairs.T @ jnp.where(rows[:, None] & columns, a, 0) @ pairs.T
     return inverse, pairs + jnp.where(~rows[:, None] & columns, -a, 0), pairs
@@ -343,7 +343,7 @@ def saddle_many(matrix: Matrices, b, jacobian, c) -> tuple[np.ndarray, np.ndarra
 
 
 def schur_complements(matrix: Matrices, jacobian: np.ndarray) -> np.ndarray:
-    """S = G K⁻¹ Gᵀ (S, m, m) of S states, as `Motion.schur_complement` of one."""
+    """The Schur complements G K⁻¹ Gᵀ (S, m, m) at S states, as `Motion.schur_complement` at one."""
     return jacobian @ solve_many(augment(matrix, jacobian)[0], np.swapaxes(jacobian, 1, 2))
 
 
@@ -364,5 +364,5 @@ def _least_norm_batch(matrix: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _is_free_of_nan(matrix: np.ndarray) -> np.ndarray:
-    """True for each of S matrices (S, n, n) without a NaN, at which LAPACK raises, (S, 1, 1)."""
+    """For each of S matrices (S, n, n): True if it has no NaN, for which LAPACK raises; shape (S, 1, 1)."""
     return np.asarray(np.isfinite(matrix).all(axis=(1, 2), keepdims=True))

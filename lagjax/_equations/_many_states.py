@@ -1,8 +1,8 @@
-"""`Sample`: the quantities of a scene at many states, in NumPy, for what judges a scene or a motion.
+"""`Sample`: the quantities of a scene at many states, in NumPy, for tests of a scene or a motion.
 
-They come from the programs of the scene, which compile nothing. Where a scene has none (arrays in its functions,
-operations without a scalar form, far too many of them) a `Sample` that holds the scene itself has XLA compile them;
-another one raises `Unlowerable`.
+They come from the programs of the scene, without compilation. If a scene has none (arrays in its functions, operations
+without a scalar form, far too many of them), a `Sample` with the scene itself has XLA compile them; one without raises
+`Unlowerable`.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._equations._derivation import Derivation, columns_of, derivation_of, numbers_of
 from lagjax._equations._linear import factorize, saddle, saddle_many, schur_complements
@@ -21,8 +22,6 @@ from lagjax._equations._sparse import Diagonal, Entries
 from lagjax._interface import Layout, halves
 from lagjax._program import Unlowerable
 from lagjax._tracing import Program
-
-PyTree = Any
 
 SADDLE = ("mass_matrix", "force", "jacobian", "gamma")  # of M q̈ − Gᵀλ = F, G q̈ = γ
 _AT_ONCE = 2**20  # entries of mass matrices that XLA computes side by side, 8 MB: memory grows like their number
@@ -46,7 +45,7 @@ class Sample(NamedTuple):
 
     @classmethod
     def from_states(cls, derivation: Derivation, y: np.ndarray, t, numbers: Sequence | np.ndarray) -> "Sample":
-        """States y = (q, q̇), (S, 2n), of a scene that has programs."""
+        """A sample of states y = (q, q̇), (S, 2n), of a scene that has programs."""
         return cls(derivation, *halves(y), t, list(numbers))
 
     @property
@@ -79,7 +78,7 @@ class Sample(NamedTuple):
         return np.broadcast_to(outputs, (len(outputs), len(self.q))).T
 
     def acceleration(self) -> np.ndarray:
-        """q̈ (S, n) by the program, or the arrays, with which a motion is followed. Raises `Unlowerable`."""
+        """q̈ (S, n) by the same program, or arrays, with which the motion is integrated. Raises `Unlowerable`."""
         if self.derivation.form.is_sparse:
             return self.quantities("acceleration")["acceleration"]
         return self.evaluate(self.derivation.accelerations.program)[:, : self.derivation.layout.size]
@@ -92,7 +91,7 @@ class Sample(NamedTuple):
         return self.evaluate(self.derivation.momenta_by_q(momenta)).reshape(shape)
 
     def evaluate_in_parts(self, function: Callable, size: int, *more):
-        """`function(sample, *more)` on at most `size` states at a time; `more` are arrays (S,), or numbers for all."""
+        """`function(sample, *more)` on chunks of at most `size` states; `more` are arrays (S,), or numbers for all."""
 
         def cut(x, start):
             return x if np.ndim(x) == 0 else x[start : start + size]
@@ -105,7 +104,7 @@ class Sample(NamedTuple):
         return parts[0] if len(parts) == 1 else jax.tree.map(lambda *some: np.concatenate(some), *parts)
 
     def pieces(self) -> np.ndarray:
-        """A number (S,) that is another one where the accelerations decide on other pieces."""
+        """A number (S,) that differs between states where the accelerations are on different pieces."""
         borders = borders_of(self.derivation)
         if borders is None:
             return np.zeros(len(self.q))
@@ -115,7 +114,7 @@ class Sample(NamedTuple):
 
 
 def borders_of(derivation: Derivation):
-    """The borders of the accelerations; None where nothing is decided, or the scene has no programs."""
+    """The borders of the accelerations; None if they are smooth, or the scene has no programs."""
     try:
         borders = derivation.borders
     except Unlowerable:
@@ -125,7 +124,7 @@ def borders_of(derivation: Derivation):
 
 @np.errstate(all="ignore")
 def solve_saddle(of: dict[str, Any]) -> tuple[Any, Any]:
-    """q̈ and λ from the quantities `SADDLE` of states in NumPy, or of one state in JAX; of a large scene its own."""
+    """q̈ and λ from the quantities `SADDLE`, of many states in NumPy or one in JAX; a large scene has its own."""
     if "mass_matrix" not in of:
         return of["acceleration"], of["multipliers"]
     matrix, b, jacobian, c = (of[name] for name in SADDLE)
@@ -166,12 +165,12 @@ def _evaluate_compiled(names: tuple[str, ...], system: Any, layout: Layout, q, q
 
 
 def numbers_of_state(derivation: Derivation) -> int:
-    """The numbers that the quantities of one state hold together: those of M, where it is a matrix."""
+    """The number of entries in the quantities of one state: n², or n for a sparse scene."""
     return derivation.layout.size ** (1 if derivation.form.is_sparse else 2)
 
 
 def map_in_chunks(function, arrays, size: int):
-    """`function` of each of the states in `arrays`, at most `size` of them at a time."""
+    """`function` mapped over the states in `arrays`, at most `size` of them at a time."""
     count = len(arrays[0])
     size = max(1, min(size, count))
     missing = -count % size
@@ -182,11 +181,11 @@ def map_in_chunks(function, arrays, size: int):
 
 
 def sparse_spectrum(derivation: Derivation, state: tuple) -> tuple | None:
-    """Of the M of a large scene, scaled to a unit diagonal: the eigenvalue next to zero and the lowest one, each with
-    its direction in coordinates, and the largest in size; None where the places of its entries are not known.
+    """The eigenvalues of the scaled M of a large scene that are nearest to zero, lowest, and largest in size.
 
-    Of a diagonal M they are exact, else good to a hundredth, by Lanczos' method (Lehoucq, Sorensen & Yang, *ARPACK
-    Users' Guide*, 1998).
+    The first two come with their eigenvectors in coordinates. None if the pattern of M is unknown. For a diagonal M
+    they are exact, else good to a hundredth, by Lanczos' method (Lehoucq, Sorensen & Yang, *ARPACK Users' Guide*,
+    1998).
     """
     from scipy.sparse import csc_array, eye_array
     from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh, splu

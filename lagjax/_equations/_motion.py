@@ -14,12 +14,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax._equations import _constraints, _linear
 from lagjax._equations._constraints import Constraints, Row, Time, Vector
 
-PyTree = Any
 Matrix = Float[Array, "n n"]
 Scalar = Float[Array, ""]
 Flag = Bool[Array, ""]
@@ -35,21 +34,21 @@ class Motion(eqx.Module):
 
     @property
     def functions(self) -> list[Callable]:
-        """L, the forces and the dissipation, as far as the scene has them."""
+        """L, the forces and the dissipation, if the scene has them."""
         return [f for f in (self.lagrangian, self.forces, self.dissipation) if f is not None]
 
     # ---- without constraints ----
 
     def momentum(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
-        """p = ∂L/∂q̇."""
+        """The momentum p = ∂L/∂q̇."""
         return jax.grad(self.lagrangian, argnums=1)(q, qdot, t, params)
 
     def mass_matrix(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Matrix:
-        """M = ∂²L/∂q̇²."""
+        """The mass matrix M = ∂²L/∂q̇²."""
         return jax.hessian(self.lagrangian, argnums=1)(q, qdot, t, params)
 
     def nonconservative_force(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
-        """Q = forces − ∂D/∂q̇."""
+        """The force Q = forces − ∂D/∂q̇."""
         force = jnp.zeros_like(q)
         if self.forces is not None:
             force += self.forces(q, qdot, t, params)
@@ -58,32 +57,32 @@ class Motion(eqx.Module):
         return force
 
     def generalized_force(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
-        """∂L/∂q + Q, which is dp/dt along the motion of a scene without constraints."""
+        """The force ∂L/∂q + Q, which is dp/dt along the motion of a scene without constraints."""
         return jax.grad(self.lagrangian)(q, qdot, t, params) + self.nonconservative_force(q, qdot, t, params)
 
     def force(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
-        """F = ∂L/∂q − (∂p/∂q) q̇ − ∂p/∂t + Q."""
+        """The force F = ∂L/∂q − (∂p/∂q) q̇ − ∂p/∂t + Q in M q̈ = F + Gᵀλ."""
         # (∂p/∂q) q̇ + ∂p/∂t is how p changes while q moves and q̇ does not: one directional derivative.
         _, drift = jax.jvp(lambda q, t: self.momentum(q, qdot, t, params), (q, t), (qdot, jnp.ones_like(t)))
         return self.generalized_force(q, qdot, t, params) - drift
 
     def mass_matrix_and_force(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Matrix, Vector]:
-        """M and F."""
+        """M and F of M q̈ = F + Gᵀλ."""
         return self.mass_matrix(q, qdot, t, params), self.force(q, qdot, t, params)
 
     def mass_product(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Callable[[Vector], Vector]:
-        """x ↦ M x."""
+        """The function x ↦ M x."""
         matrix = self.mass_matrix(q, qdot, t, params)
         return lambda x: matrix @ x
 
     def unbalanced_force(self, q: Vector, qdot: Vector, qddot: Vector, t: Time, params: PyTree) -> Vector:
-        """M q̈ − F, as dp/dt − ∂L/∂q − Q: the forces that an acceleration takes beside those of the scene."""
+        """M q̈ − F, as dp/dt − ∂L/∂q − Q: the additional force that an acceleration requires."""
         along = qdot, qddot, jnp.ones_like(t)
         _, rate = jax.jvp(lambda q, qdot, t: self.momentum(q, qdot, t, params), (q, qdot, t), along)
         return rate - self.generalized_force(q, qdot, t, params)
 
     def energy(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Scalar:
-        """h = p·q̇ − L, with dh/dt = −∂L/∂t + Q·q̇ along the motion."""
+        """The energy h = p·q̇ − L, with dh/dt = −∂L/∂t + Q·q̇ along the motion."""
         return self.momentum(q, qdot, t, params) @ qdot - self.lagrangian(q, qdot, t, params)
 
     # ---- with constraints ----
@@ -93,11 +92,11 @@ class Motion(eqx.Module):
         return self.constraints.exist
 
     def acceleration(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
-        """q̈ of M q̈ = F + Gᵀλ, G q̈ = γ; NaN where their matrix is singular."""
+        """The acceleration q̈ of M q̈ = F + Gᵀλ, G q̈ = γ; NaN where the system is singular."""
         return self.solved_acceleration(q, qdot, t, params)[0]
 
     def solved_acceleration(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Vector, Flag]:
-        """q̈, and whether the matrix that it was solved with is singular (q̈ is NaN where it is)."""
+        """The acceleration q̈, and a flag: its linear system is singular, in which case q̈ is NaN."""
         state = q, qdot, t, params
         if self.constrained:
             acceleration, _, singular = self.saddle(self.force(*state), self.constraints.gamma(*state), *state)
@@ -107,19 +106,19 @@ class Motion(eqx.Module):
         return mass.solve(force), mass.singular
 
     def multipliers(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Row:
-        """λ, those of constraints on positions first. Of least norm where G is redundant."""
+        """The multipliers λ, those of constraints on positions first; of least norm if G is redundant."""
         state = q, qdot, t, params
         return self.saddle(self.force(*state), self.constraints.gamma(*state), *state)[1]
 
     def constraint_force(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
-        """Gᵀλ, the generalised force that the constraints exert."""
+        """The generalised force Gᵀλ that the constraints exert."""
         _, pull = self.constraints.products(q, qdot, t, params)
         return pull(self.multipliers(q, qdot, t, params))
 
     def required_force(
         self, q: Vector, qdot: Vector, t: Time, params: PyTree, qddot: Vector, terms: Any = 0.0
     ) -> tuple[Vector, Bool[Array, " m"]]:
-        """τ of M q̈ = F + τ + Gᵀλ, the shortest in the metric of M⁻¹, and which constraints q̈ violates.
+        """The force τ of M q̈ = F + τ + Gᵀλ, shortest in the metric of M⁻¹, and a flag per constraint that q̈ violates.
 
         `terms` (m,) are the sizes of the terms of γ, of which rounding is left.
         """
@@ -151,7 +150,7 @@ class Motion(eqx.Module):
     # ---- what the constraints ask of a state, in the metric of M ----
 
     def unit(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
-        """The unit of each coordinate, 1/√Mᵢᵢ."""
+        """The unit 1/√Mᵢᵢ of each coordinate."""
         return _linear.diagonal_scale(self.mass_matrix(q, qdot, t, params))
 
     def row_lengths(self, unit: Vector, q: Vector, qdot: Vector, t: Time, params: PyTree, positions=False) -> Row:
@@ -164,16 +163,16 @@ class Motion(eqx.Module):
         return jax.jacfwd(of.f)(q, t, params) if positions else of.jacobian(q, qdot, t, params)
 
     def saddle(self, b: Vector, c: Row, q, qdot, t, params, positions=False) -> tuple[Vector, Row, Flag]:
-        """x, λ of M x − Gᵀλ = b, G x = c, and whether their matrix is singular; of f alone for `positions`."""
+        """x, λ of M x − Gᵀλ = b, G x = c, and a flag: singular. With `positions`, for the constraints f only."""
         return _linear.saddle(self.mass_matrix(q, qdot, t, params), b, self._jacobian(positions, q, qdot, t, params), c)
 
     def position_step(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
-        """δq of one Newton step to f = 0, the shortest in the metric of M: M δq = Jᵀμ, J δq = −f."""
+        """The Newton step δq to f = 0, the shortest in the metric of M: M δq = Jᵀμ, J δq = −f."""
         residual = self.constraints.f(q, t, params)
         return self.saddle(jnp.zeros_like(q), -residual, q, qdot, t, params, positions=True)[0]
 
     def velocity_step(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
-        """δq̇ to velocities that are consistent, the shortest in the metric of M: M δq̇ = Gᵀμ, G δq̇ = −rates."""
+        """The step δq̇ to consistent velocities, the shortest in the metric of M: M δq̇ = Gᵀμ, G δq̇ = −rates."""
         # One step arrives, as the rates are affine in q̇: for every f, and every a that d'Alembert's principle is for.
         rates = self.constraints.rates(q, qdot, t, params)
         return self.saddle(jnp.zeros_like(q), -rates, q, qdot, t, params)[0]
@@ -183,18 +182,18 @@ class Motion(eqx.Module):
         return self.constraints.residual(q, qdot, t, params)
 
     def projected(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Vector, Vector]:
-        """(q, q̇) after one Newton step of each kind back to the constraints, the shortest in the metric of M."""
+        """(q, q̇) after one Newton step each back to the constraints, the shortest in the metric of M."""
         # Enough after a step of an integration: close to the constraints Newton's method squares the distance.
         if self.constraints.on_positions is not None:
             q = q + self.position_step(q, qdot, t, params)
         return q, qdot + self.velocity_step(q, qdot, t, params)
 
     def nearest_consistent(self, q: Vector, qdot: Vector, t: Time, params: PyTree, terms=0.0) -> tuple[Vector, Vector]:
-        """The consistent state that is nearest to (q, q̇) in the metric of M; NaN where it is not found."""
+        """The consistent state nearest to (q, q̇) in the metric of M; NaN where it is not found."""
         return _constraints.nearest_consistent(self, q, qdot, t, params, terms)
 
     def solve_newton(self, linear: Callable, right: tuple[Vector, Row], *_) -> tuple[Vector, Row]:
-        """(x, ν) with H x + Jᵀν = b, J x = c, where `linear` maps (x, ν) to the left-hand sides; `right` is (b, c)."""
+        """The solution (x, ν) of H x + Jᵀν = b, J x = c; `linear` maps (x, ν) to the left sides, `right` = (b, c)."""
         b, c = right
         columns = jax.vmap(lambda x: linear((x, jnp.zeros_like(c))), out_axes=1)
         matrix, jacobian = columns(jnp.eye(b.size, dtype=b.dtype))

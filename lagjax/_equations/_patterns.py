@@ -1,19 +1,18 @@
-"""Patterns of matrices of derivatives: the entries that can differ from zero at some state, found once per scene.
+"""Sparsity patterns of Jacobians: the entries that can differ from zero at some state, found once per scene.
 
-asdex walks through the operations of a function and follows of which inputs each number is made (Hill, Dalle,
-Montoison, *An Illustrated Guide to Automatic Sparse Differentiation*, 2025). It comes with numba and is imported for
-large scenes alone. A pattern may hold entries that are zero, and must never lack one that is not.
+asdex propagates through the operations of a function on which inputs each number depends (Hill, Dalle, Montoison, *An
+Illustrated Guide to Automatic Sparse Differentiation*, 2025). It comes with numba and is imported for large scenes
+only. A pattern may have entries that are zero, and must never lack one that is not.
 
-What asdex is given is written out first: it knows constants by the variables of a jaxpr, and two calls of one compiled
-function share theirs; and it computes whole numbers as NumPy does, not as XLA. What it gives is believed where products
-with the matrix that is read off by it are those of the derivatives (`_verify_pattern`).
+The jaxpr given to asdex is unrolled first: it identifies constants by the variables of a jaxpr, and two calls of one
+compiled function share theirs; and it computes integers as NumPy does, not as XLA. Its result is accepted if products
+with the matrix recovered by it equal the derivatives (`_verify_pattern`).
 """
 
 import functools
 import itertools
 import math
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import numpy as np
@@ -22,8 +21,6 @@ from jax.extend import core
 
 from lagjax._interface import compile_for_one_call
 from lagjax._program import lack_of_memory
-
-PyTree = Any
 
 # Entries that asdex visits one by one in Python, at some 10 µs each, to follow a product of matrices. Doubled, a
 # pattern takes up to 4 s.
@@ -47,7 +44,7 @@ _MOST_PRODUCTS = 1000
 
 
 def jacobian_pattern(function: Callable, shapes: tuple, by: int) -> "scipy.sparse.csr_array | None":
-    """The pattern (m, n) of ∂f/∂x, x being argument number `by` of f, f of shape (m,); None where that takes long."""
+    """The pattern (m, n) of ∂f/∂x, x being argument number `by` of f, f of shape (m,); None if that takes long."""
     # `shapes` are those of all arguments, pytrees of them; of arrays up to that one.
     import asdex
 
@@ -71,7 +68,7 @@ def jacobian_pattern(function: Callable, shapes: tuple, by: int) -> "scipy.spars
 
 
 def _verify_pattern(pattern: "scipy.sparse.csr_array", function: Callable, leaves: list, by: int) -> bool:
-    """True if ∂f/∂x, read off by this pattern, gives the derivatives of f along vectors, at two random states."""
+    """True if ∂f/∂x, recovered with this pattern, gives the derivatives of f along vectors, at two random states."""
     # Rows that are full are read off by products from the left.
     full = bool(np.diff(pattern.indptr).max(initial=0) > _MOST_TESTED)
     pattern = scipy.sparse.csr_array(pattern.T) if full else pattern
@@ -104,7 +101,7 @@ def _verify_pattern(pattern: "scipy.sparse.csr_array", function: Callable, leave
 
 
 def _draw_numbers(rng: np.random.Generator, like: np.ndarray, low: float, whole: int) -> np.ndarray:
-    """Random numbers of a shape and dtype: whole ones below `whole`, others of order one from `low`."""
+    """Random numbers of a shape and dtype: integers below `whole`, floats of order one from `low`."""
     if np.issubdtype(like.dtype, np.inexact):
         return rng.uniform(low, 1.2, like.shape).astype(like.dtype)
     most = 2 if like.dtype == bool else np.iinfo(like.dtype).max
@@ -112,9 +109,9 @@ def _draw_numbers(rng: np.random.Generator, like: np.ndarray, low: float, whole:
 
 
 def differing_rows(values, rows, factors, exact, dtype, least: float = 0.0) -> np.ndarray:
-    """True for each row whose sum of `values` times `factors` is not the product that is `exact`, as far as finite.
+    """For each row: True if the sum of `values` times `factors` differs from the `exact` product, if it is finite.
 
-    A row counts as no smaller than the part `least` of the largest one: its terms may have cancelled.
+    A row is taken to be at least `least` times as large as the largest one: its terms may have cancelled.
     """
     terms, count = np.asarray(values, float) * factors, len(exact)
     sums, sizes = (np.bincount(rows, x, count) for x in (terms, np.abs(terms)))
@@ -124,7 +121,7 @@ def differing_rows(values, rows, factors, exact, dtype, least: float = 0.0) -> n
 
 
 def _unroll_calls(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
-    """The same function without calls, every body of a loop its own, and with the numbers that are known."""
+    """The same jaxpr without calls, with loop bodies inlined and known numbers computed."""
     return _compute_known(jax.make_jaxpr(lambda *x: _evaluate_jaxpr(closed.jaxpr, closed.consts, x))(*closed.in_avals))
 
 
@@ -153,7 +150,7 @@ def _unroll_nested(x):
 
 
 def _compute_known(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
-    """The same function, its known numbers computed by XLA where NumPy would not do as well."""
+    """The same jaxpr with operations on constants computed, by XLA instead of NumPy."""
     jaxpr, known, equations, others = closed.jaxpr, set(closed.jaxpr.constvars), [], []
     for equation in jaxpr.eqns:
         is_known = not equation.effects and all(isinstance(x, core.Literal) or x in known for x in equation.invars)
@@ -170,7 +167,7 @@ def _compute_known(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
 
 
 def gradient_memory(function: Callable, shapes: tuple) -> int:
-    """The bytes that the gradient of f by its first two arguments takes besides its result."""
+    """The bytes that the gradient of f by its first two arguments needs in addition to its result."""
     # It is about twice the largest array among its operations: 1.7 times for the distances of all pairs. Where that
     # does not fit into memory XLA is asked, which compiles it in less than a second and may never form that array.
     gradient = jax.grad(function, argnums=(0, 1))
@@ -182,16 +179,16 @@ def gradient_memory(function: Callable, shapes: tuple) -> int:
 
 
 def _largest_array(jaxpr) -> int:
-    """The bytes of the largest array that an operation of a jaxpr gives."""
+    """The bytes of the largest result of an operation in a jaxpr."""
     arrays = [v.aval for equation in jaxpr.eqns for v in equation.outvars]
     sizes = (math.prod(x.shape) * x.dtype.itemsize for x in arrays if hasattr(x, "shape"))
     return max([0, *sizes, *map(_largest_array, core.subjaxprs(jaxpr))])
 
 
 def sparse_jacobian(function: Callable, shapes: tuple) -> "Callable[..., scipy.sparse.csr_array] | None":
-    """∂f/∂x (m, n) as a function of the arguments x, … of f, by a product for each colour of its columns.
+    """A function of the arguments x, … of f that gives ∂f/∂x (m, n), by one product per colour of its columns.
 
-    None where its pattern is not known or has many colours.
+    None if its pattern is unknown or needs many colours.
     """
     pattern = jacobian_pattern(function, shapes, 0)
     if pattern is None:
@@ -223,7 +220,7 @@ def sparse_jacobian(function: Callable, shapes: tuple) -> "Callable[..., scipy.s
 
 
 def count_operations(jaxpr) -> int:
-    """The scalar operations of a jaxpr: numbers that its equations compute, those of loops in every round."""
+    """The number of scalar operations of a jaxpr: results of its equations, in loops for every round."""
     count = 0
     for equation in jaxpr.eqns:
         inner = list(core.jaxprs_in_params(equation.params))
@@ -233,8 +230,14 @@ def count_operations(jaxpr) -> int:
     return count
 
 
+def count_equations(jaxpr) -> int:
+    """The equations of a jaxpr, and of those that it calls; those of a loop count once."""
+    inner = [list(core.jaxprs_in_params(equation.params)) for equation in jaxpr.eqns]
+    return sum(sum(map(count_equations, of)) if of else 1 for of in inner)
+
+
 def _count_matrix_products(jaxpr) -> int:
-    """The count of scalar products in matrix products, and of numbers read by running sums and transforms."""
+    """The number of scalar products in matrix products, and of entries read by cumulative sums and transforms."""
     count = sum(map(_count_matrix_products, core.subjaxprs(jaxpr)))
     for equation in jaxpr.eqns:
         if equation.primitive.name == "dot_general":

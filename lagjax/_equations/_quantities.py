@@ -1,8 +1,8 @@
 """`Motion.quantities` on scalars: every function of a scene is traced as it is, and differentiated scalar by scalar.
 
 JAX differentiates whole arrays: ∂²L/∂q̇² takes as many passes over L as there are coordinates, each full of zeros that
-are folded away afterwards, and JAX takes long to trace them. On scalars only what is there is differentiated. What it
-gives is the same; `tests/equations/test_derivation.py` compares them.
+are folded away afterwards, and JAX takes long to trace them. On scalars only nonzero derivatives are computed. The
+results are the same; `tests/equations/test_derivation.py` compares them.
 """
 
 from collections.abc import Callable
@@ -19,16 +19,15 @@ from lagjax._equations._saddle import SaddleElimination
 from lagjax._program import Derivatives, Tape, copy_nodes
 from lagjax._tracing import Expansion, has_own_rules, inputs_of
 
-PyTree = Any
 Ids = np.ndarray  # scalars of a graph, in the shape of the array that they stand for
 
 
 class OwnRules(Exception):
-    """A function of a scene has rules of its own for its derivatives, which only JAX can apply."""
+    """Error: a function of a scene has custom derivative rules, which only JAX can apply."""
 
 
 class _TapedValue(NamedTuple):
-    """A value as it is written: a tape, what its scalars are in the graph, which is the value, where inputs are."""
+    """A value recorded on a tape: the nodes of the tape's scalars in the graph, its output, and positions of inputs."""
 
     tape: Tape
     nodes: list[int]
@@ -41,7 +40,7 @@ class _TapedValue(NamedTuple):
 
 
 class _ScalarState:
-    """A state on scalars: q (n,), q̇ (n,), t () and params as ids, by name, and the shapes that functions expect."""
+    """A state on scalars: q (n,), q̇ (n,), t () and params as ids, by name, with the shapes that functions expect."""
 
     def __init__(self, expansion: Expansion, shapes: tuple, leaves: list[Ids]):
         names = ("q", "qdot", "t", "params")
@@ -53,7 +52,7 @@ class _ScalarState:
         self.ids |= {name: expansion.real(self.ids[name]) for name in ("q", "qdot", "t")}
 
     def evaluate(self, function: Callable, *arguments: str, at_rest: bool = False) -> Ids:
-        """The value of a function of some of q, qdot, t, params; `at_rest` with qdot = 0."""
+        """The value of a function of the named ones of q, qdot, t, params; `at_rest` with qdot = 0."""
         values = self.ids | ({"qdot": self.zeros(self.ids["qdot"].shape)} if at_rest else {})
         leaves = jax.tree.leaves([values[name] for name in arguments])
         (value,) = self.expansion.run_closed(self._traced(function, *arguments), leaves)
@@ -67,7 +66,7 @@ class _ScalarState:
         return value
 
     def taped(self, function: Callable) -> "_TapedValue":
-        """The tape of a function of (q, q̇, t, params) with one value: its operations as written, for `gradient`."""
+        """A scalar function of (q, q̇, t, params) recorded on a tape, as written, for `gradient`."""
         tape = Tape(self.expansion.graph.budget, self.expansion.graph.moving)
         written = Expansion(tape)
         inputs = [i for leaf in jax.tree.leaves(list(self.ids.values())) for i in leaf.ravel().tolist()]
@@ -78,7 +77,7 @@ class _ScalarState:
         return _TapedValue(tape, nodes, int(output), {i: k for k, i in enumerate(inputs)})
 
     def gradient(self, of: "_TapedValue", *by: str, together: bool = True) -> list[Ids]:
-        """The derivatives of what is on a tape by each of some of q, qdot and t."""
+        """The derivatives of a taped value by each of the named ones of q, qdot and t."""
         inputs = [self.ids[name] for name in by]
         positions = [of.positions[i] for ids in inputs for i in ids.ravel().tolist()]
         again = [of.positions[i] for i in self.ids["qdot"].ravel().tolist()]
@@ -97,7 +96,7 @@ class _ScalarState:
         return np.full(shape, self.expansion.graph.constant(0.0, "float"))
 
     def jacobian(self, values: Ids, by: str) -> Ids:
-        """∂valueᵢ/∂xⱼ for x = q or qdot, shape (values, n)."""
+        """The derivatives ∂valueᵢ/∂xⱼ for x = q or qdot, shape (values, n)."""
         one = self.expansion.graph.constant(1.0, "float")
         directions = [{i: one} for i in self.ids[by].tolist()]
         result = self.zeros((values.size, len(directions)))
@@ -118,7 +117,7 @@ class _ScalarState:
         return np.array([of.get(0, self.expansion.graph.number(0.0)) for of in found], dtype=np.int64)
 
     def varying(self, values: Ids) -> np.ndarray:
-        """True for each number that depends on q, q̇ or t."""
+        """For each value: True if it depends on q, q̇ or t."""
         graph = self.expansion.graph
         moving = {i for name in ("q", "qdot", "t") for i in self.ids[name].ravel().tolist()}
         for i in self.derivatives.find_ancestors(values.ravel().tolist()):
@@ -128,10 +127,10 @@ class _ScalarState:
 
 
 def quantities(motion: Motion, expansion: Expansion, shapes: tuple, leaves: list) -> tuple[dict, Recursion | None]:
-    """`Motion.quantities`, as ids; `shapes` are those of (q, q̇, t, params) and `leaves` the ids of all their leaves.
+    """`Motion.quantities` as ids; `shapes` are those of (q, q̇, t, params) and `leaves` the ids of all their leaves.
 
-    Where accelerations take fewer operations by the recursion in L, that comes with them, and its `entries` are one
-    quantity more: `recursion` (k,). Raises `OwnRules`.
+    If the recursion in L needs fewer operations for accelerations, it is returned too, and its `entries` are one
+    further quantity: `recursion` (k,). Raises `OwnRules`.
     """
     state, everything = _ScalarState(expansion, shapes, leaves), ("q", "qdot", "t", "params")
     rates = {"q": state.ids["qdot"], "t": True}
@@ -176,7 +175,7 @@ _ORDERS = 20
 
 
 def _shorter_recursion(motion: Motion, state: _ScalarState, lagrangian: _TapedValue, matrix: Ids) -> Recursion | None:
-    """The recursion in L, where that takes fewer operations than to eliminate M; two coordinates have Cramer's rule."""
+    """The recursion in L if it takes fewer operations than eliminating M; two coordinates use Cramer's rule."""
     if motion.constraints.exist or len(matrix) < 3 or not state.varying(_nonzero_scalars(state, matrix)).any():
         return None
     recursion = recursion_of(state.derivatives, int(lagrangian.value), state.ids["qdot"].tolist())
@@ -196,7 +195,7 @@ def _shorter_recursion(motion: Motion, state: _ScalarState, lagrangian: _TapedVa
 
 
 def _cost(state: _ScalarState, nodes: list[int], places, operations: int, solution: int) -> tuple[int, float]:
-    """The operations of an elimination with its matrix, whose `nodes` stand at these places, and those of a step."""
+    """The operations of an elimination, given the nodes of its matrix and their places, and those of a Taylor step."""
     operations += state.derivatives.size(nodes)
     sums = np.where(places[:, 0] == places[:, 1], 1, 2)[state.varying(np.array(nodes))].sum()
     return operations, operations + _ORDERS * (solution + (2 + _ORDERS / 2) * float(sums))
@@ -208,7 +207,7 @@ def _entries_of(state: _ScalarState, recursion: Recursion) -> Ids:
 
 
 def unbalanced_force(motion: Motion, expansion: Expansion, shapes: tuple, leaves: list, qddot: Ids) -> Ids:
-    """`Motion.unbalanced_force` at an acceleration of ids (n,), as ids. Raises `OwnRules`."""
+    """`Motion.unbalanced_force` as ids, at an acceleration of ids (n,). Raises `OwnRules`."""
     state = _ScalarState(expansion, shapes, leaves)
     lagrangian = state.taped(motion.lagrangian)
 
@@ -257,7 +256,7 @@ def _lagrangian_derivatives(
 
 
 def _derive_shorter(state: _ScalarState, lagrangian: _TapedValue, derive: Callable[[bool], tuple[Any, Ids]]) -> tuple:
-    """A derivation and the scalars that it consists of, by `derive(together)`: the form that takes fewer operations."""
+    """The result and scalars of `derive(together)`, in the variant with fewer operations."""
     # In a kinetic energy of rotations the terms of ∂L/∂q cancel with those of (∂p/∂q) q̇. Where the cotangents of equal
     # scalars are added up at once, that is not seen: where cos q is in the kinetic and in the potential energy, one
     # term cancels and the other does not. For forces between many bodies to add them up at once is a quarter shorter.
@@ -269,7 +268,7 @@ def _derive_shorter(state: _ScalarState, lagrangian: _TapedValue, derive: Callab
 
 
 def _nonzero_scalars(state: _ScalarState, matrix: Ids) -> Ids:
-    """The scalars of a matrix that are not zero."""
+    """The entries of a matrix that are not structurally zero."""
     return matrix[matrix != state.zeros(())]
 
 

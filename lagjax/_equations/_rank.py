@@ -1,13 +1,12 @@
-"""Linear systems whose rank is decided openly: which singular values count as zero, and how wide the gap is there.
+"""Linear systems with an explicit decision of rank: which singular values count as zero, and how wide the gap is there.
 
-Symmetries, redundant conditions and closed orbits all make singular equations. A periodic orbit is never alone: it may
-begin anywhere along itself, and where momenta are conserved it may be moved and turned. So the equations that close it
-are singular, exactly so at the orbit, where the conserved quantities also make some of the equations follow from the
-others. What is solved is the part that is regular, by the shortest correction, which moves neither along the orbit nor
-along a symmetry. Which part that is, is a decision about singular values σ: zero are those below a threshold that the
-caller states.
+Symmetries, redundant conditions and closed orbits all make singular equations. A periodic orbit is never isolated: its
+start may be anywhere along it, and where momenta are conserved it may be translated and turned. So the equations that
+close it are singular, exactly so at the orbit, where the conserved quantities also make some of the equations follow
+from the rest. The regular part is solved, by the shortest correction, which moves neither along the orbit nor along a
+symmetry. The regular part is defined by singular values: those below a threshold given by the caller are zero.
 
-This is NumPy, of any number of matrices at once. What is compiled and differentiated by JAX decides by pivots instead,
+This is NumPy, for any number of matrices at once. Code that JAX compiles and differentiates decides by pivots instead,
 in `_linear` and `lagjax._analysis._solve`: a singular value decomposition would be a kernel of LAPACK inside of XLA,
 without a derivative where singular values meet.
 """
@@ -18,7 +17,7 @@ import numpy as np
 
 
 class Decided(NamedTuple):
-    """The singular values of matrices (…, m, k), largest first, and how many of them count, `rank` (…)."""
+    """The singular values of matrices (…, m, k), largest first, and the number of nonzero ones, `rank` (…)."""
 
     left: np.ndarray  # singular vectors, one a column, (…, m, min(m, k))
     values: np.ndarray
@@ -27,7 +26,7 @@ class Decided(NamedTuple):
 
     @property
     def null(self) -> np.ndarray:
-        """An orthonormal basis (k, k − rank) of what one matrix sends to zero."""
+        """An orthonormal basis (k, k − rank) of the null space of one matrix."""
         return self.right[:, int(self.rank) :]
 
     def least_norm(self, b: np.ndarray) -> np.ndarray:
@@ -40,7 +39,7 @@ class Decided(NamedTuple):
 
 
 def decide(matrices: np.ndarray, relative: np.ndarray | float = 0.0, absolute: float = 0.0) -> Decided:
-    """The rank of matrices (…, m, k): zero are singular values below `absolute`, or `relative` (…) to the largest."""
+    """The rank of matrices (…, m, k): singular values below `absolute`, or `relative` (…) to the largest, are 0."""
     m, k = matrices.shape[-2:]
     left, values, right = np.linalg.svd(matrices, full_matrices=m < k)
     bound = np.maximum(absolute, np.asarray(relative)[..., None] * values[..., :1])
@@ -48,13 +47,13 @@ def decide(matrices: np.ndarray, relative: np.ndarray | float = 0.0, absolute: f
 
 
 def null_space(rows: np.ndarray, threshold: float | None = None) -> np.ndarray:
-    """An orthonormal basis (k, K), a vector a column, of what m rows (m, k) send to zero.
+    """An orthonormal basis (k, K), as columns, of the null space of m rows (m, k).
 
-    A multiple of a row says the same, so rows are taken at unit length. Then a singular value counts as zero up to
-    `threshold` of the largest, by default √eps = 1.5e-8: rounding leaves a zero at some n eps, at most √eps where half
-    of the digits cancelled on the way, and what is smaller than √eps has no digit in the Gram matrix of the rows. Twice
-    as large it would be no other in scenes, whose rows meet at angles. Rows that are less accurate than rounding,
-    derivatives of a motion, need a threshold of their accuracy.
+    Rows are scaled to unit length, which does not change it. Then a singular value counts as zero up to `threshold` of
+    the largest, by default √eps = 1.5e-8: rounding leaves a zero at n eps, at most √eps if half of the digits cancelled
+    before, and what is smaller than √eps has no digit in the Gram matrix of the rows. Twice as large it would give the
+    same in scenes, whose rows meet at angles. Rows that are less accurate than rounding, derivatives of a motion, need
+    a threshold of their accuracy.
     """
     threshold = float(np.sqrt(np.finfo(rows.dtype).eps)) if threshold is None else threshold
     lengths = np.linalg.norm(rows, axis=1, keepdims=True)
@@ -64,8 +63,8 @@ def null_space(rows: np.ndarray, threshold: float | None = None) -> np.ndarray:
 def span_outside(basis: np.ndarray, known: np.ndarray) -> np.ndarray:
     """An orthonormal basis (n, k) of the part of the span of `basis` (n, m) that is not in the span of `known` (n, l).
 
-    Both are orthonormal. Singular values are the sines of angles to `known`, one or zero but for rounding where its
-    span lies in the other; the largest comes first.
+    Both are orthonormal. Singular values are the sines of angles to `known`, zero or one up to rounding if its span
+    lies in the other; the largest comes first.
     """
     left, sines, _ = np.linalg.svd(basis - known @ (known.T @ basis), full_matrices=False)
     return left[:, sines > 0.5]

@@ -34,7 +34,7 @@ Form = dict[int, int]  # a linear combination of unknowns: the node of the facto
 
 
 class Recursion(NamedTuple):
-    """The sparse system of `size` coordinates and of velocities that L builds from them: its unknowns are q̈, w, μ."""
+    """The sparse system for q̈ (`size` coordinates), velocities w that L builds recursively, and multipliers μ."""
 
     size: int
     definitions: list[Form]  # the terms of every w
@@ -55,7 +55,7 @@ class Recursion(NamedTuple):
 
 
 def recursion_of(derivatives: Derivatives, value: int, qdot: Sequence[int]) -> Recursion | None:
-    """The recursion in a Lagrangian, whose node is `value`; None where no velocity is used twice."""
+    """The recursion in a Lagrangian, whose node is `value`; None if no velocity is used twice."""
     graph = derivatives.graph
     linear, curved, uses = _linear_nodes(derivatives, derivatives.find_ancestors([value]), qdot)
     frontier = sorted({x for i in curved for x in derivatives.node_to_differentiate(i)[1] if x in linear})
@@ -71,7 +71,7 @@ def recursion_of(derivatives: Derivatives, value: int, qdot: Sequence[int]) -> R
 
 
 def _linear_nodes(derivatives: Derivatives, below: Iterable[int], qdot: Sequence[int]):
-    """The nodes that are affine in q̇, with their terms; those that are not; and how often the former are used."""
+    """The nodes that are affine in q̇, with their terms; those that are not; and the number of uses of the former."""
     linear: dict[int, list[tuple[int, int]]] = {i: [] for i in qdot}
     curved: dict[int, None] = {}
     uses = dict.fromkeys(qdot, 0)
@@ -93,7 +93,7 @@ def _linear_nodes(derivatives: Derivatives, below: Iterable[int], qdot: Sequence
 
 
 def _affine_terms(graph: Graph, op: str, operands: Sequence[int], linear) -> list[tuple[int, int]] | None:
-    """A node as a sum of nodes that are affine in q̇, each with a factor, and of others; None where it is not one."""
+    """A node as a sum of (affine node, factor) pairs; None if it is not affine in q̇."""
     one, minus = (graph.constant(x, "float") for x in (1.0, -1.0))
     if op == "neg":
         return [(operands[0], minus)]
@@ -140,10 +140,10 @@ def _frontier_hessian(derivatives: Derivatives, value: int, curved: Iterable[int
 
 
 class _AffineNodes:
-    """Nodes that are affine in q̇ as combinations of unknowns: coordinates, and velocities that are worth one.
+    """Nodes that are affine in q̇ as combinations of unknowns: coordinates, and velocities w worth an unknown.
 
-    That is where a combination of several unknowns is used more than once, or is squared (is `energetic`). What is used
-    once, as Iω in ½ ω·(Iω), is better written out.
+    A combination of several unknowns becomes an unknown if it is used more than once, or squared (`energetic`). One
+    used once, as Iω in ½ ω·(Iω), is better written out.
     """
 
     def __init__(self, graph: Graph, qdot: Sequence[int], energetic: set[int], uses: dict[int, int]):
@@ -194,7 +194,7 @@ _LARGEST_COUNT = 10_000_000  # operations that are counted
 
 
 class _EliminationStep(NamedTuple):
-    """The eliminated unknown, the unknowns that define it (none: a coordinate), and all others that it meets then."""
+    """A step of elimination: the unknown, the unknowns that define it (none: a coordinate), and those coupled to it."""
 
     unknown: int
     terms: tuple[int, ...]
@@ -204,8 +204,8 @@ class _EliminationStep(NamedTuple):
 class RecursiveElimination:
     """The sparse system of a recursion as straight-line arithmetic, for one pattern of zeros.
 
-    `entries` (k, 2) lists the rows and columns of what may not be zero on and below the diagonal: `factors` takes a
-    vector of these in that order. Both functions are for `Scalars` alone.
+    `entries` (k, 2) lists the rows and columns of entries that may be nonzero on and below the diagonal: `factors`
+    takes a vector of these in that order. Both functions are for `Scalars` only.
     """
 
     def __init__(self, recursion: Recursion, dtype):
@@ -216,11 +216,11 @@ class RecursiveElimination:
 
     @property
     def complete(self) -> bool:
-        """True if everything can be eliminated: no pivot is zero whatever the state."""
+        """True if every unknown can be eliminated: no pivot is structurally zero."""
         return len(self.steps) == self.size + self.velocities
 
     def operations(self, numbers: Sequence[float | None]) -> tuple[int, int]:
-        """The operations of elimination and one solution, and of the solution of an order of a Taylor series."""
+        """The numbers of operations of elimination with one solution, and of one order of a Taylor series."""
         # `numbers` has those of the entries that are known.
         graph = Graph(_LARGEST_COUNT)
         expansion = Expansion(graph)
@@ -241,14 +241,14 @@ class RecursiveElimination:
         return of_first, Derivatives(graph).size([*z.ids.tolist(), *factors.ids.tolist()]) - before
 
     def factors(self, values: Scalars) -> tuple[Any, Any]:
-        """The factors that `solve` needs, a tree of vectors, and whether a pivot was lost."""
+        """The factors that `solve` needs, a tree of vectors, and a flag: a pivot was lost."""
         work = _EnergyElimination(self, values)
         for step in self.steps:
             work.velocity(step) if step.terms else work.coordinate(step)
         return Scalars(values.expansion, np.array(work.factors)), Scalars(values.expansion, np.array(work.lost))
 
     def solve(self, factors: Scalars, right: Scalars) -> Scalars:
-        """q̈, w and μ, linear in `right`, of as many numbers."""
+        """q̈, w and μ, linear in `right`, which has the same length."""
         graph, of_steps, end = right.expansion.graph, [], 0
         apply, z, ids = graph.apply, *([graph.real(i) for i in x.ids.tolist()] for x in (right, factors))
 
@@ -282,7 +282,7 @@ class RecursiveElimination:
 
 
 class _EnergyElimination:
-    """The entries of the energy while unknowns are eliminated, nodes of a graph."""
+    """The entries of the energy matrix during elimination, as nodes of a graph."""
 
     def __init__(self, elimination: RecursiveElimination, values: Scalars):
         self._graph = graph = values.expansion.graph
@@ -308,7 +308,7 @@ class _EnergyElimination:
         _add_to_sum(self._graph, sums, key, self._apply("mul", a, b))
 
     def velocity(self, step: _EliminationStep) -> None:
-        """Put its definition, Σ c u, in the place of a velocity w: r w + ½ h w² becomes Σ c u r + ½ h (Σ c u)²."""
+        """Substitute the definition Σ c u for a velocity w: r w + ½ h w² becomes Σ c u r + ½ h (Σ c u)²."""
         w, definition = step.unknown, self._definitions[step.unknown]
         own = self._energy.pop((w, w), None)
         coupled = {u: self._energy.pop(_ordered_pair(w, u)) for u in step.others if _ordered_pair(w, u) in self._energy}
@@ -334,7 +334,7 @@ class _EnergyElimination:
         self.factors.append(zero if own is None else own)
 
     def coordinate(self, step: _EliminationStep) -> None:
-        """Let a coordinate move freely: what is left of the energy is its least value for all its velocities."""
+        """Eliminate a coordinate: what remains of the energy is its minimum over the velocity of that coordinate."""
         x, size = step.unknown, self._sizes.pop(step.unknown)
         pivot = self._energy.pop((x, x))
         least = self._number(0.0) if pivot == size else self._apply("mul", self._threshold, size)
@@ -352,7 +352,7 @@ class _EnergyElimination:
 
 
 def _steps(size: int, terms: list[set[int]], energy: set[tuple[int, int]]) -> Iterator[_EliminationStep]:
-    """The order of elimination: of what may be eliminated, that which meets the fewest others."""
+    """The order of elimination: of the unknowns that may be eliminated, that coupled to the fewest (minimum degree)."""
     # Ends early at a coordinate without energy, whose pivot would be zero, or with none but that of products of
     # different velocities: nothing then tells how large its pivot should be.
     others: list[set[int]] = [set() for _ in range(size + len(terms))]
@@ -394,7 +394,7 @@ def _steps(size: int, terms: list[set[int]], energy: set[tuple[int, int]]) -> It
 
 
 def _fill_in(x: int, terms: Sequence[int], now: set[int], others: list[set[int]], moving: set[int]) -> None:
-    """The entries of the energy that are no longer zero once x is eliminated."""
+    """Add the entries of the energy that become nonzero when x is eliminated."""
     coupled = others[x] - {x}
     for u in now:
         others[u].discard(x)

@@ -1,22 +1,22 @@
-"""The linear system behind every acceleration on scalars: one elimination that keeps the zeros of its matrix.
+"""The linear system behind every acceleration, on scalars: an elimination that keeps the zeros of its matrix.
 
     M x = b                     without constraints
     M x − Gᵀλ = b,   G x = c    with constraints: for z = (x, −λ),   A z = (b, c),   A = (M Gᵀ; G 0)
 
-A mechanism couples a part to few others, but M⁻¹ and the Schur complement G M⁻¹ Gᵀ have hardly a zero left: to
-eliminate all of M and then all constraints takes operations that grow with the cube of the number of links. Here a
-constraint is eliminated after the last of its own coordinates, and all of them in an order that fills few zeros
-(minimum degree: Tinney & Walker, Proc. IEEE 55 (1967) 1801, scheme 2). A chain of n links then costs n times a link,
-a diagonal M one division for each coordinate, and blocks of M do not meet.
+A mechanism couples a part to few others, but M⁻¹ and the Schur complement G M⁻¹ Gᵀ are full: to eliminate all of M and
+then all constraints takes operations that grow with the cube of the number of links. Here a constraint is eliminated
+after the last of its own coordinates, and all of them in an order with little fill-in (minimum degree: Tinney & Walker,
+Proc. IEEE 55 (1967) 1801, scheme 2). A chain of n links then costs n times a link, a diagonal M one division for each
+coordinate, and blocks of M stay separate.
 
-M positive definite needs no pivoting. What is left of M, once coordinates E and constraints C that touch only E are
+A positive definite M needs no pivoting. What is left of M, once coordinates E and constraints C on E only are
 eliminated, is the mass matrix of the other coordinates where those of E move freely under C. It lies between that
 without C, which is M's own Schur complement, and that with E at rest, a block of M. The pivots of coordinates are
 therefore positive, those of constraints negative or, where a constraint depends on those before it, zero; no entry
-grows. The rank so found is that of the rows of G that came before: all their coordinates did, too.
+grows. The rank so found is that of the preceding rows of G, whose coordinates were all eliminated before.
 
-The formulas are for vectors of `Scalars` as well as for arrays of JAX: a pivot, its column of L, and what it takes off
-all that is left, at once.
+The formulas work for vectors of `Scalars` and for arrays of JAX: each step takes a pivot, its column of L, and the
+update of all remaining entries at once.
 """
 
 import functools
@@ -41,19 +41,19 @@ LARGEST_INDEFINITE = 16
 
 
 class SaddleElimination:
-    """A z = (b, c) as straight-line arithmetic, for one pattern of zeros: M positive (semi)definite.
+    """The solution of A z = (b, c) as straight-line arithmetic, for one pattern of zeros: M positive (semi)definite.
 
-    `zeros` marks what is zero in M (n, n) and in G (m, n) whatever the state; m may be zero. M is `augmented` by GᵀW G,
-    W diagonal, unless it is known to be regular: GᵀW G x = GᵀW c changes neither x nor λ. Redundant rows are left out
-    of λ: the motion is the same, the multipliers are a solution but not the shortest. With `regular_only`, the
-    regular-M variant of `Accelerations.program`, the saddle point is called singular as soon as it loses digits:
-    where M, or what the constraints make of it, is within `REGULAR` of singular.
+    `zeros` marks structural zeros of M (n, n) and G (m, n); m may be zero. M is `augmented` by GᵀW G, W diagonal,
+    unless it is known to be regular: GᵀW G x = GᵀW c changes neither x nor λ. Redundant rows get λ = 0: the motion is
+    the same, the multipliers are a solution but not the shortest. With `regular_only`, the regular-M variant of
+    `Accelerations.program`, the saddle point counts as singular as soon as it loses digits: where M, or its restriction
+    by the constraints, is within `REGULAR` of singular.
 
-    Where rows may be `released`, −1 stands on the diagonal of one that is, beside a row of G that is zero: its λ is.
+    If rows may be `released`, a released one has −1 on the diagonal and a zero row of G, so that its λ is zero.
 
-    `entries` lists the row and column of what may not be zero in M, on and below its diagonal, then in G, whose rows
-    are numbered from n, and then the diagonal of rows that may be released: the vectors that `factors` takes are in
-    that order.
+    `entries` lists the row and column of entries that may be nonzero in M, on and below its diagonal, then in G, whose
+    rows are numbered from n, and then the diagonal of rows that may be released: `factors` takes a vector in that
+    order.
     """
 
     def __init__(self, zeros: tuple, dtype, augmented: bool, regular_only: bool, released: bool = False):
@@ -73,7 +73,7 @@ class SaddleElimination:
         self._place_entries(filled)
 
     def _place_entries(self, filled: np.ndarray) -> None:
-        """The places in a vector of the entries of A on and below its diagonal: the diagonal, then L by columns."""
+        """Assign slots of a vector to the entries of A on and below its diagonal: the diagonal, then L by columns."""
         total, place = len(self.order), np.argsort(self.order)
         self.slots = np.full((total, total), -1, np.int32)
         self.slots[range(total), range(total)] = range(total)
@@ -95,7 +95,7 @@ class SaddleElimination:
     # ---- factors ----
 
     def factors(self, values) -> tuple[Any, Any]:
-        """The factors of M and G, of `values` at `entries`, for `solve`, and whether the saddle point is singular."""
+        """The factors of M and G, from `values` at `entries`, for `solve`, and a flag: the saddle point is singular."""
         a, weighted, singular = xp.scatter(values, self.slots[tuple(self.entries.T)], self.count), None, None
         if self.augmented:
             a, weighted = self._weight_entries(a)
@@ -107,7 +107,7 @@ class SaddleElimination:
         return (weighted, lower, inverse), lost if singular is None else singular | lost
 
     def _factor_lower(self, a) -> tuple[Any, Any, Any]:
-        """L in the order of the pivots, D⁻¹, and whether a pivot was lost to round-off."""
+        """L in the order of the pivots, D⁻¹, and a flag: a pivot was lost to round-off."""
         n, total = self.size, len(self.order)
         # What coordinates take off the diagonal, and what constraints do: in a constraint the two must stay separate.
         taken: list[list] = [[[], []] for _ in range(total)]
@@ -138,7 +138,7 @@ class SaddleElimination:
         return xp.concatenate(columns) if columns else a[:0], xp.stack(inverse), lost
 
     def _mass_pivot(self, j: int, diagonal, terms: list) -> tuple[Any, Any]:
-        """A flag that the rest of Mⱼⱼ is round-off, and its inverse; NaN where it is."""
+        """A flag that the remaining Mⱼⱼ is round-off, and its inverse; NaN where it is."""
         if not terms and not self.massless[j]:
             return diagonal == 0.0, 1.0 / diagonal
         pivot = functools.reduce(operator.sub, terms, diagonal)
@@ -146,7 +146,7 @@ class SaddleElimination:
         return lost, 1.0 / xp.where(lost, np.nan, pivot)
 
     def _constraint_pivot(self, of_coordinates: list, of_constraints: list) -> tuple[Any, Any]:
-        """A flag that a constraint depends on those before it, and D⁻¹: then left out, or NaN if `regular_only`."""
+        """A flag that a constraint depends on those before it, and D⁻¹: then 0, or NaN if `regular_only`."""
         # The pivot is −G M⁻¹ Gᵀ of this constraint, and what those before it take off that. A row that is left out
         # changes nothing where the constraints are consistent.
         own: Any = sum(of_coordinates, start=0.0)
@@ -175,7 +175,7 @@ class SaddleElimination:
     # ---- solution ----
 
     def solve(self, factors: tuple[Any, Any, Any], right):
-        """x and then −λ, n + m numbers, linear in `right`: b and then c."""
+        """The solution x and then −λ, n + m numbers, linear in `right`: b and then c."""
         weighted, lower, inverse = factors
         z, n = right, self.size
         start = 0
@@ -198,7 +198,7 @@ class SaddleElimination:
 
     @functools.cached_property
     def _rows_of_lower(self) -> list[tuple[int, tuple[np.ndarray, np.ndarray]]]:
-        """Each row, in the order of elimination, the columns in which L has an entry there, and the entries' places."""
+        """Each row, in the order of elimination, with the columns in which L has an entry, and the entries' slots."""
         total, columns = len(self.order), {i: [] for i in self.order}
         for j in self.order:
             for i in self.below[j].tolist():
@@ -208,11 +208,11 @@ class SaddleElimination:
 
 
 class DraggedElimination:
-    """A z = r + (Bλ, 0) with z = (x, −λ): each multiplier brings a force of its own, a column of B (n, m).
+    """The solution of A z = r + (Bλ, 0), z = (x, −λ): each multiplier causes a further force, a column of B (n, m).
 
     With z₀ = A⁻¹ r and Z = A⁻¹ (B, 0), z = z₀ + Z λ, where (1 − P) λ = λ₀ and −P are the last rows of Z. `zeros` (n, m)
-    marks what is zero in B whatever the state. What is left of c − G x is solved for once more: of bodies at rest it is
-    rounding of large forces, by which they would creep, and behind that of their accelerations alone.
+    marks structural zeros of B. The residual c − G x is solved for once more: for bodies at rest it is the rounding of
+    large forces, by which they would creep, and afterwards only that of their accelerations.
     """
 
     def __init__(self, elimination: SaddleElimination, zeros: np.ndarray):
@@ -243,7 +243,7 @@ class DraggedElimination:
         return (factors, of_rows, xp.stack(columns), Scalars(matrix.expansion, np.array(both))), singular
 
     def solve(self, factors, right):
-        """x and then −λ, linear in `right`: b and then c."""
+        """The solution x and then −λ, linear in `right`: b and then c."""
         of_saddle, of_rows, *of_drag = factors
         n, saddle = self.saddle.size, self.saddle
         z = saddle.solve(of_saddle, right)
@@ -264,10 +264,10 @@ class DraggedElimination:
 
 
 class TwoCoordinates:
-    """M x = b for two coordinates, by Cramer's rule: it needs no pivoting, and takes the fewest operations.
+    """The solution of M x = b for two coordinates, by Cramer's rule: no pivoting, and the fewest operations.
 
-    `zeros` (2, 2) marks what is zero in M whatever the state; the rest is as in `SaddleElimination`. A determinant that
-    cancels to round-off is singularity; it is replaced by NaN.
+    `zeros` (2, 2) marks structural zeros of M; the rest is as in `SaddleElimination`. A determinant that cancels to
+    round-off means singular; it is replaced by NaN.
     """
 
     def __init__(self, zeros: np.ndarray, dtype):
@@ -275,7 +275,7 @@ class TwoCoordinates:
         self.entries = np.array([[0, 0], [1, 1]] if self.diagonal else [[0, 0], [1, 0], [1, 1]])
 
     def factors(self, values) -> tuple[Any, Any]:
-        """The entries and the inverse determinant, or the diagonal, and whether M is singular."""
+        """The entries and the inverse determinant, or the diagonal, and a flag: M is singular."""
         if self.diagonal:
             return values, (values[0] == 0.0) | (values[1] == 0.0)
         a, c, d = (values[k] for k in range(3))
@@ -285,7 +285,7 @@ class TwoCoordinates:
         return xp.stack([a, c, d, 1.0 / xp.where(singular, np.nan, determinant)]), singular
 
     def solve(self, factors, right):
-        """x, two numbers, linear in `right`."""
+        """The solution x, two numbers, linear in `right`."""
         if self.diagonal:
             return right / factors
         a, c, d, inverse = (factors[k] for k in range(4))
@@ -293,10 +293,10 @@ class TwoCoordinates:
 
 
 class IndefiniteElimination:
-    """M x = b for an M that need not be positive definite, with no more coordinates than `LARGEST_INDEFINITE`.
+    """The solution of M x = b for an M that may be indefinite, with at most `LARGEST_INDEFINITE` coordinates.
 
-    Its columns are made orthogonal (`_tracing/lowering`), where other matrices are eliminated with pivots. `zeros`
-    (n, n) marks what is zero in M whatever the state; the rest is as in `SaddleElimination`.
+    Its columns are made orthogonal (`_tracing/lowering`), because pivoting would be a border. `zeros` (n, n) marks
+    structural zeros of M; the rest is as in `SaddleElimination`.
     """
 
     def __init__(self, zeros: np.ndarray, dtype):
@@ -305,7 +305,7 @@ class IndefiniteElimination:
         self.operations = 3 * self.size**3
 
     def factors(self, values) -> tuple[Any, Any]:
-        """Q and R, and whether M is singular: what is left of a column, squared, is round-off."""
+        """Q and R, and a flag: M is singular, as the squared remainder of a column is round-off."""
         n, (row, column) = self.size, self.entries.T
         places = np.full((n, n), len(self.entries))
         places[row, column] = places[column, row] = np.arange(len(self.entries))
@@ -317,15 +317,15 @@ class IndefiniteElimination:
         return factors._replace(duals=duals), xp.fold("or", lost)
 
     def solve(self, factors, right):
-        """x, linear in `right`."""
+        """The solution x, linear in `right`."""
         return solve_orthogonalized(factors, right)
 
 
 def elimination_order(mass: np.ndarray, rows: np.ndarray) -> tuple[list[int], np.ndarray]:
-    """The order in which coordinates 0 … n−1 and constraints n … n+m−1 are eliminated, and what is filled by then.
+    """The order in which coordinates 0 … n−1 and constraints n … n+m−1 are eliminated, and the resulting pattern.
 
-    `mass` (n, n) and `rows` (m, n) mark what need not be zero; `filled` (n + m, n + m) marks that of L and Lᵀ. A
-    constraint comes after all of its coordinates, without which its pivot might be zero though it is not redundant.
+    `mass` (n, n) and `rows` (m, n) mark entries that may be nonzero; the result (n + m, n + m) marks those of L and Lᵀ.
+    A constraint comes after all of its coordinates: before them its pivot might be zero though it is not redundant.
     """
     m, n = rows.shape
     filled = np.block([[mass | mass.T, rows.T], [rows, np.zeros((m, m), bool)]])

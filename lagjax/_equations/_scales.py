@@ -1,10 +1,10 @@
-"""The sizes of coordinates, velocities and time of a scene at a state: what "small" is measured by there.
+"""The sizes of coordinates, velocities and time of a scene at a state: the scales for "small" changes there.
 
 A number of a state has the units of its author, who may write a molecule in metres and a planet in seconds. So no
-number is small by itself, and nothing here compares one with 1. What coordinates of different units have in common is
+number is small by itself, and nothing here is compared with 1. What coordinates of different units have in common is
 the kinetic energy, ½ Mᵢᵢ q̇ᵢ² of each: with |x| = maxᵢ √|Mᵢᵢ| |xᵢ| a length l in that metric is l/√|Mᵢᵢ| of coordinate
-i, a radian for an angle φ beside a radius r, whose Mᵢᵢ is m r². The forces do the rest, by how they vary along a line
-through the state, F(q + εu) with |u| = 1:
+i, a radian for an angle φ next to a radius r, whose Mᵢᵢ is m r². The forces give the rest, by how they vary along a
+line through the state, F(q + εu) with |u| = 1:
 
     l    the larger of |q| and |q̇|/√(∂F/∂ε), but the latter no larger than r, the smallest ε at which F is not linear
          any more; where both are zero r, else |F|/(∂F/∂ε), else |q̇|²/|F|,
@@ -12,9 +12,9 @@ through the state, F(q + εu) with |u| = 1:
     ω    the largest of |q̇|/l, of √(∂F/∂ε), and of ∂F/∂q̇; else √(|F|/l)
     qᵢ ~ max(|qᵢ|, l/√|Mᵢᵢ|),   q̇ᵢ ~ max(|q̇ᵢ|, ω l/√|Mᵢᵢ|),   t ~ 1/ω
 
-F is measured as |F| = maxᵢ |Fᵢ|/√|Mᵢᵢ|. A scene that has none of these has no size, and any is as good: it is 1. Other
-units of any coordinate, of time and of mass change all of it as they change the state. Of the alternatives, an array of
-the user as a unit of its own would take r and φ of one array as alike; exact dimensions would have to be declared.
+F is measured as |F| = maxᵢ |Fᵢ|/√|Mᵢᵢ|. A scene that has none of these has no size, and it is set to 1. New units of
+any coordinate, of time and of mass change all of these as they change the state. Alternatives: an array of the user as
+a unit of its own would give r and φ of one array equal scales; exact dimensions would have to be declared.
 """
 
 from collections.abc import Callable
@@ -78,7 +78,7 @@ def _measure_scales(evaluate, root: Numbers, q: Numbers, qdot: Numbers) -> Scale
 
 
 def _linear_range(force: Callable, steps: np.ndarray) -> tuple[float, float]:
-    """∂F/∂ε along a line, and the smallest step at which F is not linear; 0 where there is none."""
+    """∂F/∂ε along a line, and the smallest step at which F is not linear; 0 if there is none."""
     linear, bent, change = _bracket_nonlinearity(force, steps)
     if not linear.any():  # a jump or a power, which are the same at all scales
         return 0.0, 0.0
@@ -101,7 +101,7 @@ _ROUNDS, _BETWEEN = 8, 25
 
 
 def _bracket_nonlinearity(force: Callable, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The steps up to which F is linear, those where it is not, and its change."""
+    """Masks of the steps up to which F is linear and of those where it is not, and its change."""
     ahead, back, twice, twice_back, here = (force(x) for x in (steps, -steps, 2 * steps, -2 * steps, np.zeros(1)))
     odd, even = (ahead - back) / 2, (ahead + back) / 2 - here
     change, size = np.abs(odd).max(axis=1), np.maximum(np.abs(ahead), np.abs(back)).max(axis=1)

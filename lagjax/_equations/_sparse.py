@@ -1,4 +1,4 @@
-"""Symmetric matrices of which the pattern is known: read off by a few products, and solved by what the pattern allows.
+"""Symmetric matrices with a known sparsity pattern: recovered from a few products, and solved by the pattern's form.
 
     diagonal            divide
     blocks              the connected components of the pattern, each at most `LARGEST_BLOCK` large, in groups of a size
@@ -6,9 +6,9 @@
     sparse              conjugate gradients with the entries
     products            conjugate gradients with products alone, where no pattern is known, or one that is dense
 
-Columns that share no row are read off together: a form has a colour for each column, and the product of the matrix with
-the indicator of each colour gives all entries (Curtis, Powell & Reid, *On the estimation of sparse Jacobian matrices*,
-1974). No form holds n × n numbers. All are written in array operations, for the reason given in `_linear`.
+Columns that share no row are recovered together: a form has a colour for each column, and the product of the matrix
+with the indicator of each colour gives all entries (Curtis, Powell & Reid, *On the estimation of sparse Jacobian
+matrices*, 1974). No form stores n × n numbers. All are written in array operations, for the reason given in `_linear`.
 """
 
 import abc
@@ -39,7 +39,7 @@ _MOST_ITERATIONS = 2000  # enough for a condition of 1e4: some 18 √κ of them 
 
 
 class Solver(NamedTuple):
-    """Solver of A x = b at one state, of an `iterative` form to half of the digits."""
+    """A solver of A x = b at one state; that of an `iterative` form gives half of the digits."""
 
     solve: Product
     singular: Bool[Array, ""]  # to working precision
@@ -55,10 +55,11 @@ class MatrixForm(abc.ABC):
 
     @abc.abstractmethod
     def prepare(self, multiply: Product, dtype, dependent: bool = False) -> Solver:
-        """The solver of the matrix with these products.
+        """The solver of the matrix with these products x ↦ A x.
 
         A matrix with `dependent` rows is positive semi-definite, and b in its range: rows that are combinations of
-        others count as zero (`rank_tolerance`), and their unknowns are zero or small. Else a singular matrix gives NaN.
+        others count as zero (`rank_tolerance`), and their unknowns are zero or small. Otherwise a singular matrix gives
+        NaN.
         """
 
     @abc.abstractmethod
@@ -67,7 +68,7 @@ class MatrixForm(abc.ABC):
 
 
 class Entries(MatrixForm):
-    """A form that reads off the entries at `rows`, `columns` by products with the indicators of `colors`."""
+    """A form that recovers the entries at `rows`, `columns` from products with the indicators of `colors`."""
 
     def __init__(self, pattern: "scipy.sparse.csr_array", colors: np.ndarray):
         entries = pattern.tocoo()
@@ -83,7 +84,7 @@ class Entries(MatrixForm):
         return self.read(multiply, dtype)[self.on_diagonal]
 
     def read_scaled(self, multiply: Product, dtype) -> tuple[Array, Vector]:
-        """The entries with both sides scaled to a unit diagonal, and the scale (n,); a zero there stays."""
+        """The entries with both sides scaled to a unit diagonal, and the scale (n,); a zero on it stays zero."""
         entries = self.read(multiply, dtype)
         size = jnp.abs(entries[self.on_diagonal])
         scale = 1 / jnp.sqrt(jnp.where(size > 0, size, 1))
@@ -91,7 +92,7 @@ class Entries(MatrixForm):
 
 
 class Diagonal(Entries):
-    """Every row has its diagonal entry alone."""
+    """The form of a diagonal matrix."""
 
     name = "diagonal"
 
@@ -106,7 +107,7 @@ class Diagonal(Entries):
 
 
 class Blocks(Entries):
-    """Connected components: `groups` of those of one size, each an array (count, size) of rows."""
+    """The form of a block-diagonal matrix: `groups` of blocks of one size, each an array (count, size) of rows."""
 
     def __init__(self, pattern: "scipy.sparse.csr_array", label: np.ndarray):
         order, sizes = np.argsort(label, kind="stable"), np.bincount(label)
@@ -151,7 +152,7 @@ class Blocks(Entries):
 
 
 class Band(Entries):
-    """A band of `width` entries on either side of the diagonal, in the `order` of reverse Cuthill–McKee."""
+    """The form of a matrix with `width` entries on either side of the diagonal, in the `order` of Cuthill–McKee."""
 
     def __init__(self, pattern: "scipy.sparse.csr_array", order: np.ndarray, width: int):
         place = np.argsort(order)
@@ -206,7 +207,7 @@ class Band(Entries):
 
 
 class Sparse(Entries):
-    """Entries in rows that are filled up to one length, for products; conjugate gradients solve with them."""
+    """The form of a general sparse matrix: padded rows for products; conjugate gradients solve with them."""
 
     iterative = True
 
@@ -234,7 +235,7 @@ class Sparse(Entries):
 
 @dataclass(frozen=True)
 class MatrixFree(MatrixForm):
-    """No pattern: conjugate gradients with products of the matrix."""
+    """The form of a matrix without a known pattern: conjugate gradients with its products."""
 
     iterative = True
     size: int
@@ -252,7 +253,7 @@ class MatrixFree(MatrixForm):
 
 
 def conjugate_gradients(multiply: Product, b: Vector) -> Vector:
-    """x with A x = b for a positive (semi-)definite A, to half of the digits; NaN where it is not reached."""
+    """The solution x of A x = b for a positive (semi-)definite A, to half of the digits; NaN without convergence."""
     # Source: Hestenes & Stiefel, J. Res. NBS 49 (1952) 409.
     tolerance, limit = float(jnp.finfo(b.dtype).eps) ** 0.5, min(_MOST_ITERATIONS, 4 * b.size)
     x, _ = jax.scipy.sparse.linalg.cg(multiply, b, tol=tolerance, maxiter=limit)
@@ -261,7 +262,7 @@ def conjugate_gradients(multiply: Product, b: Vector) -> Vector:
 
 
 def refine(product: Callable, solve: Callable, right):
-    """x of A x = `right`, pytrees, from an approximate `solve`: its digits twice. `product` is x ↦ A x."""
+    """The solution x of A x = `right`, pytrees, refined from an approximate `solve`; `product` is x ↦ A x."""
 
     def once_more(_, carry):
         x, rest = carry
@@ -272,7 +273,7 @@ def refine(product: Callable, solve: Callable, right):
 
 
 def form_of(pattern: Any, size: int) -> MatrixForm:
-    """The form that suits the pattern of a symmetric matrix; None is an unknown one."""
+    """The form for the pattern of a symmetric matrix; None is an unknown pattern."""
     if pattern is None:
         return MatrixFree(size)
     diagonal = scipy.sparse.csr_array((np.ones(size, bool), (np.arange(size), np.arange(size))), shape=(size, size))

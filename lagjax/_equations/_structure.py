@@ -1,9 +1,9 @@
-"""`SparseMotion`: the motion of a large scene, whose matrices are solved by their patterns and never written down.
+"""`SparseMotion`: the motion of a large scene, whose matrices are solved by their patterns and never stored.
 
     S = G M⁻¹ Gᵀ        λ = S⁻¹ (c − G M⁻¹ b)        x = M⁻¹ (b + Gᵀλ)
 
-M is regular here: where constraints hold what L leaves open, machine code and dense arrays have the other form
-(`_linear`). Products with M, G and Gᵀ are derivatives along one direction.
+M is regular here: if only the constraints make the system regular, machine code and dense arrays use `_linear`'s form.
+Products with M, G and Gᵀ are derivatives along one direction.
 """
 
 import functools
@@ -23,7 +23,7 @@ from lagjax._interface import compiled_once
 
 
 class SparseStructure(NamedTuple):
-    """The forms of M, of S = G M⁻¹ Gᵀ, and of S for the constraints on positions alone (None without any)."""
+    """The forms of M, of S = G M⁻¹ Gᵀ, and of S for the constraints on positions only (None without any)."""
 
     mass: MatrixForm
     schur: MatrixForm | None
@@ -35,12 +35,12 @@ class SparseStructure(NamedTuple):
 
 
 def mass_form(motion: Motion, shapes: tuple) -> MatrixForm:
-    """The form of M, of a scene of these shapes of (q, q̇, t, params)."""
+    """The form of M, for a scene with these shapes of (q, q̇, t, params)."""
     return form_of(jacobian_pattern(jax.grad(motion.lagrangian, argnums=1), shapes, by=1), shapes[0].size)
 
 
 def structure_of(motion: Motion, shapes: tuple, mass: MatrixForm) -> SparseStructure | None:
-    """The structure of a large scene; None where the operations of its constraints do not tell a pattern."""
+    """The structure of a large scene; None if the pattern of its constraints is unknown."""
     q, _, t, numbers = shapes
     if not motion.constrained:
         return SparseStructure(mass, None, None)
@@ -61,7 +61,7 @@ def structure_of(motion: Motion, shapes: tuple, mass: MatrixForm) -> SparseStruc
 
 
 def _pattern_of_inverse(form: MatrixForm) -> "scipy.sparse.csr_array | None":
-    """The pattern of M⁻¹ where it is sparse: diagonal, or full blocks."""
+    """The pattern of M⁻¹ if it is sparse: diagonal, or full blocks; else None."""
     n = form.size
     if isinstance(form, Diagonal):
         return scipy.sparse.csr_array((np.ones(n, np.int32), (np.arange(n), np.arange(n))), shape=(n, n))
@@ -73,7 +73,7 @@ def _pattern_of_inverse(form: MatrixForm) -> "scipy.sparse.csr_array | None":
 
 
 class SparseMotion(Motion):
-    """`Motion` by the `SparseStructure` of its scene."""
+    """A `Motion` that solves with the `SparseStructure` of its scene."""
 
     structure: SparseStructure = eqx.field(static=True, kw_only=True)
 
@@ -94,12 +94,12 @@ class SparseMotion(Motion):
         return jnp.where(mass.singular, jnp.nan, x), mass.singular
 
     def saddle(self, b: Vector, c: Row, q, qdot, t, params, positions=False) -> tuple[Vector, Row, Flag]:
-        """x, λ of M x − Gᵀλ = b, G x = c, and whether M is singular; of f alone for `positions`."""
+        """x, λ of M x − Gᵀλ = b, G x = c, and a flag: M is singular. With `positions`, for the constraints f only."""
         positions = positions and self.constraints.on_velocities is not None
         return _compile_saddle(self, positions)(b, c, q, qdot, t, params)
 
     def _prepare_solvers(self, positions: bool, *state, products=None) -> tuple[Solver, Solver, Callable]:
-        """The solvers of M and of S, and (b, c) ↦ (x, −λ), of G with these `products`, x ↦ G x and λ ↦ Gᵀλ."""
+        """The solvers of M and of S, and (b, c) ↦ (x, −λ); `products` are x ↦ G x and λ ↦ Gᵀλ."""
         dtype = state[0].dtype
         push, pull = self.constraints.products(*state, positions=positions) if products is None else products
         mass = self.structure.mass.prepare(self.mass_product(*state), dtype)
@@ -114,13 +114,13 @@ class SparseMotion(Motion):
         return mass, schur, eliminate
 
     def _schur_form(self, positions: bool) -> MatrixForm:
-        """The form of S, or of S for the constraints on `positions` alone."""
+        """The form of S, or of S for the constraints on `positions` only."""
         form = self.structure.positions if positions else self.structure.schur
         assert form is not None
         return form
 
     def rank_lost(self, start: tuple, end: tuple) -> Flag:
-        """True if fewer constraints are independent at `end` than at `start`; where S is banded or in blocks."""
+        """True if fewer constraints are independent at `end` than at `start`; needs S banded or in blocks."""
         (t0, t1), numbers = (jnp.asarray(state[2]) for state in (start, end)), start[3]
         states = jax.lax.stop_gradient(jax.tree.map(lambda *x: jnp.stack(x), (*start[:2], t0), (*end[:2], t1)))
         before, after = jax.lax.map(lambda y: self._prepare_solvers(False, *y, numbers)[1].rank, states)
@@ -136,7 +136,7 @@ class SparseMotion(Motion):
         return jnp.sqrt(form.diagonal(lambda y: push(unit**2 * pull(y)), q.dtype))
 
     def quantities(self, q, qdot, t, params):
-        """Those of `Motion.quantities` without M and G, and what products with them give.
+        """The quantities of `Motion.quantities` without M and G, and with products of these instead.
 
         - `mass_diagonal` (n,) of M, `energy_by_qdot` (n,), M q̇, and `mass_by_some` (n,), M x for some x.
         - `acceleration` (n,), `multipliers` (m,).
@@ -168,7 +168,7 @@ class SparseMotion(Motion):
         return {name: value for name, value in values.items() if name not in ("mass_matrix", "jacobian")}
 
     def solve_newton(self, linear: Callable, right: tuple[Vector, Row], *state) -> tuple[Vector, Row]:
-        """(x, ν) with H x + Jᵀν = b, J x = c, by GMRES, preconditioned by solves with M in the place of H."""
+        """The solution (x, ν) of H x + Jᵀν = b, J x = c, by GMRES, preconditioned by solves with M in place of H."""
         zero = jax.tree.map(jnp.zeros_like, right)
         products = lambda x: linear((x, zero[1]))[1], lambda nu: linear((zero[0], nu))[0]
         eliminate = self._prepare_solvers(True, *jax.lax.stop_gradient(state), products=products)[2]
@@ -183,7 +183,7 @@ class SparseMotion(Motion):
 
 @functools.lru_cache(maxsize=64)
 def _compile_saddle(motion: SparseMotion, positions: bool) -> Callable:
-    """`SparseMotion.saddle` as a compiled function of b, c and the state, in two rounds."""
+    """`SparseMotion.saddle` as a compiled function of b, c and the state, with one refinement."""
 
     def saddle(b: Vector, c: Row, *state):
         mass, _, eliminate = motion._prepare_solvers(positions, *jax.lax.stop_gradient(state))

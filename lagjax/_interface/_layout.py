@@ -14,11 +14,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax._interface._results import join_names
-
-PyTree = Any
 
 
 @jax.tree_util.register_static

@@ -11,10 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import PyTree
 
 from lagjax._interface._layout import dtype_of, labelled_leaves
-
-PyTree = Any
 
 
 def as_arrays(tree: PyTree, dtype, name: str = "params") -> PyTree:

@@ -1,19 +1,19 @@
-"""Integration of batches in machine code made for one scene: the processor's vectors and all its cores.
+"""Integration of batches of motions in machine code compiled for one scene, for vector registers and all cores.
 
     Program ──_program._series──► recurrences ──motions──► LLVM ──code._ir──► Kernel(arrays) → arrays
 
-XLA compiles one operation after the other for all members of a batch; here one member after the other goes through all
-operations, four or eight side by side in the lanes of vector registers, and nothing leaves the first caches. A step is
-one Taylor series, of the order that the tolerance asks for.
+XLA executes one operation after another, each for all members of a batch; here one member after another passes through
+all operations, four or eight of them side by side in the lanes of vector registers, and the data stay in the first
+caches. A step is one Taylor series, whose order follows from the tolerance.
 
 Four storeys, each built on those before it:
 
-    code/       the words of machine code: instructions, memory, loops, constants, objects on disk
+    code/       the means to emit machine code: instructions, memory, loops, constants, objects on disk
     series/     the Taylor series of a motion, on vectors or from tables, and the programs that it is made from
-    steps/      a step: its size, its end on constraints, and the first event, knot or border in it
-    motions/    whole motions, forward and back, and their launchers: on threads, from XLA, on GPUs
+    steps/      a step: its size, its projection onto constraints, and the first event, knot or border in it
+    motions/    whole motions, their derivatives, and their launchers: on threads, from XLA, on GPUs
 
-Nothing here knows JAX: arrays are NumPy's, and a program is data (`_program._series.Recurrent`).
+This room does not import JAX: arrays are NumPy's, and a program is data (`_program._series.Recurrent`).
 """
 
 from lagjax._native.code._constants import (

@@ -1,13 +1,13 @@
-"""Functions that compute in float64 for callers whose numbers are float32: rounded once, when all is done.
+"""Functions that compute in float64 although the caller's numbers are float32; only the result is rounded.
 
-While `jax_enable_x64` is off JAX has no float64. `jax.enable_x64(True)` around a part of a program turns it on for as
-long as that part is traced; it is differentiated, batched and compiled later, with the switch off, and JAX's own rules
-then mix precisions. So such a part is one primitive whose parameter is a function g of arrays, and the rules of the
-primitive turn the switch on around all that happens to g. Its derivative is a function again,
+While `jax_enable_x64` is off JAX has no float64. `jax.enable_x64(True)` around a part of a program turns it on while
+that part is traced; it is differentiated, batched and compiled later, with the switch off, and then JAX's own rules mix
+precisions. So such a part becomes one primitive whose parameter is a function g of arrays, and the rules of the
+primitive turn the switch on whenever they transform g. Its derivative is a function of the same kind,
 
     (x, v) ↦ Dg(x) v      linear in v, transposed: (x, w) ↦ Dg(x)ᵀ w
 
-and so are the derivatives of that: there are all orders in all modes. A derivative computes g(x) once more.
+so that derivatives of all orders exist, in both modes. A derivative computes g(x) once more.
 """
 
 import contextlib
@@ -34,10 +34,10 @@ _WIDE = {narrow: wide for wide, narrow in _NARROW.items()}
 
 
 def compute_in_doubles(function: Callable, *arguments: PyTree) -> PyTree:
-    """`function(*arguments)` in float64: of arrays that are rounded to float32 first, with arrays of float32.
+    """`function(*arguments)` computed in float64; arrays are rounded to float32 before and after.
 
-    Integers of the result are those that JAX has at present. What is not an array stays what it is. It works under
-    every transformation of JAX; where nothing is traced, the function is called with NumPy arrays.
+    Integers of the result have the type that JAX has at present. Leaves that are not arrays are passed on unchanged. It
+    works under every transformation of JAX; where nothing is traced, the function is called with NumPy arrays.
     """
     leaves, tree = jax.tree.flatten(arguments)
     places = [i for i, leaf in enumerate(leaves) if isinstance(leaf, jax.Array | np.ndarray | np.generic)]
@@ -63,7 +63,7 @@ def compute_in_doubles(function: Callable, *arguments: PyTree) -> PyTree:
 
 
 def accepts_singles(state: tuple[str, ...], others: tuple[str, ...] = ()) -> Callable:
-    """A decorator: `compute_in_doubles` calls the function in float64 where the arguments named in `state` are float32.
+    """A decorator: the function is computed in float64 if the arguments named in `state` are float32.
 
     The arguments named in `others`, which are numbers too, are converted with them.
     """
@@ -86,7 +86,7 @@ def accepts_singles(state: tuple[str, ...], others: tuple[str, ...] = ()) -> Cal
 
 
 def with_doubles(function: Callable) -> Callable:
-    """A decorator: the function is called with float64 on; arrays that it returns are in JAX's own precision."""
+    """A decorator: the function runs with float64 enabled; arrays that it returns have JAX's current precision."""
 
     @functools.wraps(function)
     def decorated(*args, **kwargs):
@@ -98,7 +98,7 @@ def with_doubles(function: Callable) -> Callable:
 
 
 def _are_single(numbers: PyTree) -> bool:
-    """True if JAX would compute with these numbers in float32. What is wrong with them is for others to say."""
+    """True if JAX would compute with these numbers in float32; leaves that are no numbers are ignored."""
     kinds = set()
     for leaf in jax.tree.leaves(numbers):
         with contextlib.suppress(TypeError, ValueError):
@@ -119,7 +119,7 @@ def _widen(array) -> np.ndarray:
 
 
 def _narrow_array(array, keeps_integers: bool):
-    """The array as float32, by NumPy, which compiles nothing; what NumPy holds stays there."""
+    """The array as float32 (and int32), converted by NumPy without compilation; a NumPy array stays one."""
     narrow = np.asarray(array).astype(_narrow_tree(array.dtype, keeps_integers), copy=False)
     return narrow if not isinstance(array, jax.Array) else jax.device_put(narrow)
 
@@ -136,10 +136,10 @@ def _narrow_tree(dtype, keeps_integers: bool) -> np.dtype:
 
 @dataclass(frozen=True, eq=False)
 class _DoublesMap:
-    """A function of arrays (*x, *v) that returns a list of arrays, and is linear in the last `linear` arguments, v.
+    """A function of arrays (*x, *v) that returns a list of arrays and is linear in v, its last `linear` arguments.
 
-    `transposed(*x, *w)` gives the cotangents of v from those of the results. `results` are the shapes and types of
-    these, where they are known without tracing the function.
+    `transposed(*x, *w)` gives the cotangents of v from cotangents w of the results. `results` are the shapes and types
+    of the results, if they are known without tracing the function.
     """
 
     function: Callable
@@ -148,7 +148,7 @@ class _DoublesMap:
     results: tuple[ShapedArray, ...] | None = None
 
     def derivative(self, size: int, moving: tuple[int, ...], results: dict[int, ShapedArray]) -> "_DoublesMap":
-        """(*its `size` arguments, *tangents of those that are `moving`) ↦ the tangents of these `results`."""
+        """The map from the `size` arguments, then tangents of those at positions `moving`, to tangents of `results`."""
 
         def restrict_to_moving(arguments, others):
             def function(*moved):
@@ -168,7 +168,7 @@ class _DoublesMap:
         return _DoublesMap(forward, len(moving), back, tuple(results.values()))
 
     def batched(self, axes: tuple, size: int) -> "_DoublesMap":
-        """The map for batches of this size along these axes of its arguments, and along the first of its results."""
+        """The map for a batch of `size` members along `axes` of its arguments; results have the batch as first axis."""
         first, back = len(axes) - self.linear, self.transposed
 
         def transposed(*given):

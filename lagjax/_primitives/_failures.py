@@ -1,10 +1,10 @@
-"""Motions that did not reach their end, in a program of JAX: it raises, or is NaN in values and derivatives.
+"""Reports of motions that failed: an error is raised, or values and their derivatives become NaN.
 
 A failure is known when the numbers are: at once in plain Python and under `jax.vmap` or `jax.grad` alone, at run time
-inside `jax.jit`. `raise_where_failed` is one primitive for all of them. What it returns is passed through it, so that
-the check cannot be dropped as dead code where only a derivative is used: the derivative passes through it as well.
+inside `jax.jit`. `raise_where_failed` is one primitive for all cases. The values it returns depend on the check, and so
+do their derivatives, so that the check is not removed as dead code.
 
-An output that was not reached has no derivative. `where` alone would make it zero in reverse mode, since its other
+An output that was not reached has no derivative. `where` alone would make it zero in reverse mode, since its second
 branch is a constant; `nan_unless` makes it NaN wherever its cotangent is not zero.
 """
 
@@ -32,11 +32,11 @@ from lagjax._primitives._linear_map import (
 
 
 def raise_where_failed(tree, result, end, t_last, names: tuple[str, ...]):
-    """`tree` again, where its motion ended well; else `SimulationError`, naming what failed, when and in which member.
+    """`tree` unchanged if its motion succeeded; else `SimulationError`, naming what failed, when, in which member.
 
-    `result` holds a result code, `end` = (t, y) the time and the state (2n,) at which the motion ended, `t_last` the
-    time it was to reach, and `names` (n,) those of the coordinates. Inside `jax.jit` the error is JAX's own, and its
-    text ends with this one.
+    `result` is a result code, `end` = (t, y) the time and the state (2n,) at which the motion ended, `t_last` the time
+    it was to reach, and `names` (n,) those of the coordinates. Inside `jax.jit` the error is JAX's own, and its text
+    ends with this one.
     """
     (passed,) = check_p.bind(*map(jnp.asarray, (result, end[0], t_last, end[1])), names=names)
     return _nan_unless_passed(passed, tree)
@@ -51,9 +51,9 @@ def _nan_unless_passed(passed, tree):
 
 
 def sentence(result, t_end, t_last, y_end, names: tuple[str, ...], why: str | None = None) -> str | None:
-    """The first failure among members with any batch axes, its time and its state; None where all ended well.
+    """The error sentence of the first failed member: its time and state; None if no member failed.
 
-    `why` stands for the advice on its result, where more is known.
+    All arrays may have batch axes. `why`, if given, replaces the general advice on the result code.
     """
     result, t_end, t_last, y_end = map(np.asarray, (result, t_end, t_last, y_end))
     failed = np.argwhere(~np.isin(result, ENDED_WELL)).tolist()
@@ -91,7 +91,7 @@ compute_on_host(check_p, _raise_failure)
 
 
 def _lower_check(call: Callable):
-    """One comparison where all is well; the host is called, by `call(host, shape, *arrays)`, where something failed."""
+    """The lowering of the check: one comparison on the device; `call(host, shape, *arrays)` after a failure."""
 
     def check(result, t_end, *others, names):
         def host(*arrays):
@@ -117,7 +117,7 @@ NOT_EXPORTED = (
 
 
 def _lower_callback(rule: Callable, what: str, in_exports: bool = False):
-    """The rule of what may not be exported, as calls back to this process."""
+    """The lowering `rule` of a primitive that calls back to this process; it refuses `jax.export`, naming `what`."""
 
     def lower_checked(context, *args, **settings):
         if context.module_context.lowering_parameters.for_export and not in_exports:
@@ -140,17 +140,17 @@ mlir.register_lowering(steps_p, _lower_callback(_same, "the checks of diffrax's 
 
 
 def mark_steps(ended):
-    """The marks of outputs of diffrax that were reached; `ValueError` where they are exported with its checks."""
+    """The flags of the outputs that diffrax reached, unchanged; `ValueError` if they are exported with its checks."""
     return steps_p.bind(ended)[0]
 
 
 # ---- outputs that were not reached -----------------------------------------------------------------------------------
 
 
-def marks_absent(function: Callable) -> Callable:
-    """A decorator for what returns NaN where there is nothing: after an event, beyond the last crossing or transition.
+def allows_nan(function: Callable) -> Callable:
+    """A decorator for functions whose results contain NaN as "none": after an event, or beyond the last crossing.
 
-    `jax_debug_nans` would take that for a mistake of an operation. A motion that fails has its own result and sentence.
+    `jax_debug_nans`, which would report these as errors, is off inside. A failed motion has a result code of its own.
     """
 
     @functools.wraps(function)
@@ -162,20 +162,20 @@ def marks_absent(function: Callable) -> Callable:
 
 
 def nan_unless(reached, x):
-    """`x` where `reached` holds, else NaN; so are its derivatives, but for the zero cotangent of an unused value."""
-    return lost_unless(reached, x, ())
+    """`x` where `reached` is true, else NaN, derivatives too; the cotangent of an unused value stays zero."""
+    return undefined_unless(reached, x, ())
 
 
-def lost_unless(reached, x, inputs):
-    """`x` where `reached` holds, else NaN; and so are its derivatives of every order by it and all floats of `inputs`.
+def undefined_unless(reached, x, inputs):
+    """`x` where `reached` is true, else NaN, and so are its derivatives of all orders by x and floats of `inputs`.
 
-    Where a derivative is not wanted, it stays zero.
+    A zero cotangent stays zero.
     """
     return nan_unless_p.bind(jnp.broadcast_to(reached, jnp.shape(x)), x, *_float_arrays(inputs), marks=True, batch=0)
 
 
 def differentiable_where(well, x, *inputs):
-    """`x` itself, whose derivatives by it and by `inputs` are NaN unless `well` holds."""
+    """`x` unchanged; its derivatives by x and by `inputs` are NaN unless `well` is true."""
     return nan_unless_p.bind(jnp.broadcast_to(well, jnp.shape(x)), x, *_float_arrays(inputs), marks=False, batch=0)
 
 
@@ -188,7 +188,7 @@ def _nan_unless(reached, x, *_, marks, batch, library: Any = jnp):
 
 
 def _nan_unless_transpose(cotangent, reached, x, *inputs, marks, batch):
-    """The transpose in x and in those inputs that it is linear in; the first axes of arrays are a `batch`."""
+    """The transpose in x and in those inputs that it is linear in; the first `batch` axes of arrays are batches."""
     cotangent = ad.instantiate_zeros(cotangent)
     kept = reached | (cotangent == 0)
     all_kept = kept.all(tuple(range(batch, kept.ndim)))
@@ -207,7 +207,7 @@ def _nan_unless_transpose(cotangent, reached, x, *inputs, marks, batch):
 
 
 def _nan_unless_jvp(primals, tangents, **settings):
-    """Its derivative varies with what varies, and once more with everything."""
+    """The tangent, NaN like the value; it keeps all inputs as arguments, so that its own derivatives are NaN too."""
     reached, x, *inputs = primals
     moving = [t for t in tangents[2:] if not is_zero(t)]
     along = ad.instantiate_zeros(tangents[1])

@@ -1,13 +1,14 @@
-"""`LinearMap`: the one way in which a primitive of ours is taught to JAX, under all of its transformations.
+"""`LinearMap`: the base class of lagjax's JAX primitives, which defines all of their transformation rules.
 
 With y = f(x, v), linear in v, and D the derivative of f by x,
 
-    dy = f(x, dv) + D(x, v) dx            batches: one call, with the members in front
+    dy = f(x, dv) + D(x, v) dx            batches: one call, with the members as the first axis
     transposed: (x, w) ↦ the cotangents of v
 
-`attach_derivative` gives values the derivatives of another expression. `jax.custom_jvp` says the same, but inside
-`jax.lax.scan` its rule is lost where forward mode goes over reverse mode (jax 0.10: the value is then differentiated
-instead, without a word; tests/equations/test_custom.py keeps the case). A primitive of its own is not seen through.
+`attach_derivative` gives values the derivatives of another expression. `jax.custom_jvp` does the same, but inside
+`jax.lax.scan` its rule is lost where forward mode is applied to reverse mode (jax 0.10: the value is then
+differentiated instead, without a warning; tests/equations/test_custom.py keeps the case). A primitive has no body to
+differentiate.
 """
 
 import functools
@@ -25,9 +26,9 @@ from jax.sharding import PartitionSpec
 
 
 class VaryingPrimitive(Primitive):
-    """A primitive whose results vary, under `jax.shard_map`, along every mesh axis that an argument varies along.
+    """A primitive whose results, under `jax.shard_map`, vary along every mesh axis along which an argument varies.
 
-    JAX writes that into the types of arrays, and reads off them which cotangents are summed over the devices.
+    JAX keeps these axes in the types of arrays, and derives from them which cotangents are summed over the devices.
     """
 
     on_host: Callable  # (*arrays, **settings) by NumPy, with members in front
@@ -47,13 +48,13 @@ class VaryingPrimitive(Primitive):
 
 
 def _with_type_variation(given: ShapedArray, result: ShapedArray) -> ShapedArray:
-    """The type of a result that varies as the type that is given does."""
+    """The type `result`, varying along the mesh axes of the type `given`."""
     everywhere = given.sharding.update(spec=PartitionSpec(*[None] * result.ndim))
     return result.update(sharding=everywhere, manual_axis_type=given.mat)
 
 
 def vary_alike(arrays: Sequence, like: Sequence = ()) -> list:
-    """These arrays, each varying along every mesh axis that one of them, or one of `like`, varies along."""
+    """The arrays, each varying along every mesh axis along which one of them, or of `like`, varies."""
     own = [jax.typeof(x).mat.varying for x in (*arrays, *like)]
     axes = frozenset().union(*own)
     return [
@@ -62,11 +63,11 @@ def vary_alike(arrays: Sequence, like: Sequence = ()) -> list:
     ]
 
 
-def start_alike(first, *operands):
-    """The pytree that rounds begin with, whose numbers all vary as one of them does, or one of the `operands`.
+def vary_carry_alike(first, *operands):
+    """The initial carry of a loop, whose numbers all vary along the mesh axes of its numbers and the `operands`.
 
-    Else a number that is the same on all devices has its cotangent summed over them in each round, for which devices
-    that are done with theirs would wait for ever.
+    Otherwise the cotangent of a number that is equal on all devices is summed over them in each round, and devices that
+    have finished their rounds would block the others.
     """
     numbers, others = eqx.partition(first, eqx.is_array_like)
     arrays, structure = jax.tree.flatten(numbers)
@@ -74,10 +75,10 @@ def start_alike(first, *operands):
 
 
 def cond_alike(predicate, when_true: Callable, when_false: Callable, *operands):
-    """`jax.lax.cond`, of which both branches' results vary as the operands do."""
+    """`jax.lax.cond` in which the results of both branches vary along the mesh axes of the operands."""
 
     def alike(branch):
-        return lambda *operands: start_alike(branch(*operands), operands)
+        return lambda *operands: vary_carry_alike(branch(*operands), operands)
 
     return jax.lax.cond(predicate, alike(when_true), alike(when_false), *operands)
 
@@ -85,10 +86,10 @@ def cond_alike(predicate, when_true: Callable, when_false: Callable, *operands):
 class LinearMap(VaryingPrimitive):
     """A primitive (*x, *v; settings) ↦ a list of arrays, linear in its last `linear` arguments v.
 
-    `shapes` gives the types of its results. `vary(primals, tangents of x, results, **settings)` gives their change
-    along x, None for a result that has none; a tangent that is zero may be an `ad.Zero`. `transpose(x, w, v,
-    **settings)` gives the cotangents of v, of which only the shapes are known, from those of the results, w. `linear`
-    may be a function of the settings.
+    `shapes` gives the types of its results. `vary(primals, tangents of x, results, **settings)` gives the tangents of
+    the results due to x, None for a zero one; a tangent that is zero may be an `ad.Zero`. `transpose(x, w, v,
+    **settings)` gives the cotangents of v, whose shapes alone are known, from those of the results, w. `linear` may be
+    a function of the settings.
     """
 
     multiple_results = True
@@ -105,7 +106,7 @@ class LinearMap(VaryingPrimitive):
         batching.primitive_batchers[self] = self._batch
 
     def _first(self, arguments, settings: dict) -> int:
-        """The number of arguments x."""
+        """The number of arguments x: the position of the first argument v."""
         return len(arguments) - (self._linear(**settings) if callable(self._linear) else self._linear)
 
     def _derive(self, primals, tangents, **settings):
@@ -131,7 +132,7 @@ class LinearMap(VaryingPrimitive):
 
 
 def compute_on_host(primitive: Primitive, function: Callable) -> None:
-    """Outside of `jit`, let `function` compute a primitive from arrays of NumPy, with float64 on."""
+    """Register `function`, on NumPy arrays and with float64 on, as the evaluation of a primitive outside `jit`."""
 
     def evaluate(*arrays, **settings):
         with jax.enable_x64(True):
@@ -146,12 +147,12 @@ def is_zero(tangent) -> bool:
 
 
 def zero_like(x) -> ad.Zero:
-    """The tangent of a result that does not vary."""
+    """The symbolic zero tangent of a result that does not vary."""
     return ad.Zero(jax.typeof(x).to_tangent_aval())
 
 
 def cotangent_of(argument, cotangent):
-    """The cotangent of an argument of a transpose, summed over axes that it shares; None where its value is known."""
+    """The cotangent of an argument of a transpose, summed over broadcast axes; None if the argument is known."""
     if not ad.is_undefined_primal(argument):
         return None
     shape = argument.aval.shape
@@ -160,7 +161,7 @@ def cotangent_of(argument, cotangent):
 
 
 def batch_in_front(arrays, axes) -> list:
-    """The arguments of a batching rule, each with the batch as its first axis, those that are shared as well."""
+    """The arguments of a batching rule, each with the batch as first axis; unbatched ones are broadcast."""
     size = next(x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None)
     return [
         x if axis == 0 else jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
@@ -172,12 +173,12 @@ def batch_in_front(arrays, axes) -> list:
 
 
 def attach_derivative(function: Callable, values: tuple, *arguments) -> tuple:
-    """`values`, a tuple of arrays, with the derivatives of `function(*arguments)`, a tuple like it; of every order.
+    """The tuple `values` with the derivatives, of every order, of `function(*arguments)`, a tuple of equal shapes.
 
-    `function` may only vary with its arguments, which are arrays.
+    `function` may depend on its arguments only, which are arrays.
     """
     fixed = [jax.lax.stop_gradient(jnp.asarray(x)) for x in values]
-    return tuple(with_p.bind(*fixed, *map(jnp.asarray, arguments), function=function, count=len(fixed)))
+    return tuple(attach_p.bind(*fixed, *map(jnp.asarray, arguments), function=function, count=len(fixed)))
 
 
 def _first_arrays(*arrays, function, count):
@@ -196,24 +197,24 @@ def _vary_expression(primals, tangents, _, *, function, count):
 
 
 def _batch_expression(arrays, axes, *, function, count):
-    return with_p.bind(*batch_in_front(arrays, axes), function=jax.vmap(function), count=count), [0] * count
+    return attach_p.bind(*batch_in_front(arrays, axes), function=jax.vmap(function), count=count), [0] * count
 
 
-with_p = LinearMap("lagjax_differentiated_as", lambda *avals, count, **_: list(avals[:count]), vary=_vary_expression)
-with_p.def_impl(_first_arrays)
-mlir.register_lowering(with_p, mlir.lower_fun(_first_arrays, multiple_results=True))
-batching.primitive_batchers[with_p] = _batch_expression
+attach_p = LinearMap("lagjax_differentiated_as", lambda *avals, count, **_: list(avals[:count]), vary=_vary_expression)
+attach_p.def_impl(_first_arrays)
+mlir.register_lowering(attach_p, mlir.lower_fun(_first_arrays, multiple_results=True))
+batching.primitive_batchers[attach_p] = _batch_expression
 
 
 # ---- derivatives along which some numbers stay together --------------------------------------------------------------
 
 
-def keep_together(y, offsets, limits):
-    """`y` (…, m), whose derivatives are NaN along directions in which an offset (…, k) varies by more than its limit.
+def limit_directions(y, offsets, limits):
+    """`y` (…, m); its derivatives are NaN along directions in which an offset (…, k) changes by more than its limit.
 
-    In reverse mode no direction is known: where a limit is finite, derivatives are NaN in all of them.
+    Reverse mode has no single direction: where a limit is finite and the cotangent is not zero, derivatives are NaN.
     """
-    return together_p.bind(limits, y, offsets)[0]
+    return limited_p.bind(limits, y, offsets)[0]
 
 
 def _mask_far(limits, y, offsets, library: Any = jnp):
@@ -227,17 +228,17 @@ def _pull_mask(known, cotangents, moving):
     return [cotangent, jnp.where(lost, jnp.nan, 0.0)]
 
 
-together_p = LinearMap("lagjax_together", lambda limits, y, _: [y], lambda *_: [None], 2, _pull_mask)
-together_p.def_impl(_mask_far)
-together_p.on_host = functools.partial(_mask_far, library=np)
-mlir.register_lowering(together_p, mlir.lower_fun(_mask_far, multiple_results=True))
+limited_p = LinearMap("lagjax_together", lambda limits, y, _: [y], lambda *_: [None], 2, _pull_mask)
+limited_p.def_impl(_mask_far)
+limited_p.on_host = functools.partial(_mask_far, library=np)
+mlir.register_lowering(limited_p, mlir.lower_fun(_mask_far, multiple_results=True))
 
 
 # ---- linear systems --------------------------------------------------------------------------------------------------
 
 
 def solve(a, b):
-    """X with A X = B, for A (…, n, n) and B (…, n); NaN where A is singular."""
+    """The solution x of A x = b, for A (…, n, n) and b (…, n); NaN where A is singular."""
     return solve_p.bind(a, b)[0]
 
 

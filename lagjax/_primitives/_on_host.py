@@ -1,8 +1,8 @@
-"""Functions of JAX on the host: traced once, then evaluated by NumPy for all members of a batch, without XLA.
+"""JAX functions on the host: traced once, then evaluated in NumPy for all members of a batch, without XLA.
 
-What XLA compiles for a second runs here at once, a microsecond an operation and array. Every array has the members in
-front, or one row that all share; an operation acts behind that axis. Primitives of ours are evaluated by the functions
-that `compute_on_host` was given.
+XLA would compile for a second what runs here at once, at a microsecond per operation and array. The first axis of every
+array is that of the members, or has length one if all members share the values; an operation acts on the other axes.
+Primitives of lagjax are evaluated by the functions registered with `compute_on_host`.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ _FOLDS: dict[str, Callable] = {
 
 
 class HostFunction:
-    """A function of arrays and lists of arrays, traced for arguments of these `examples`, whose leaves it takes."""
+    """A JAX function traced at arguments of the shapes of `examples`; calls take their leaves, with a member axis."""
 
     others: Callable  # of an operation, and what it is given that is known: its function, where none is below
 
@@ -69,7 +69,7 @@ class HostFunction:
         return len(self._values) - 1
 
     def _write_calls(self, traced, inputs: list[int], calls: list) -> list[int]:
-        """Add the calls of what was traced; the slots of its results."""
+        """Append the calls of a traced function, with these slots of inputs, to `calls`; the slots of its results."""
         slots = dict(zip(traced.jaxpr.invars, inputs, strict=True))
         slots |= {of: self._slot_of(x) for of, x in zip(traced.jaxpr.constvars, traced.consts, strict=True)}
 
@@ -95,7 +95,7 @@ class HostFunction:
         return [slot(x) for x in traced.jaxpr.outvars]
 
     def _add_operation(self, equation, given: list[int], calls: list) -> list[int]:
-        """The slots of the results of an operation: at once of constants, known ones of what was computed before."""
+        """The slots of an operation's results; constants are folded and repeated operations are shared."""
         key = equation.primitive.name, str(equation.params), *given
         if key in self._made:
             return self._made[key]
@@ -112,7 +112,7 @@ class HostFunction:
 
 
 def _operation_rule(equation, known: dict) -> Callable:
-    """The function of arrays, with an axis of members in front, that an operation is; some of them are `known`."""
+    """The NumPy function of an operation, for arrays with a member axis; `known` has its constant operands."""
     name, params = equation.primitive.name, equation.params
     axes, shape = [x.aval.ndim for x in equation.invars], equation.outvars[0].aval.shape
     if function := getattr(equation.primitive, "on_host", None):
@@ -177,7 +177,7 @@ def _split(axis: int, sizes, **_):
 
 
 def _pad(begin: tuple, shape: tuple, config) -> Callable:
-    """Of each axis, numbers go to `low` + j (`inner` + 1), as far as that lies within."""
+    """Rule of `lax.pad`: entry j of an axis moves to `low` + j (`inner` + 1), entries outside the shape are dropped."""
     taken, placed = [slice(None)], [slice(None)]
     for size, total, (low, _, inner) in zip(begin, shape, config, strict=True):
         step = int(inner) + 1
@@ -212,10 +212,10 @@ def _product(dimension_numbers, **_):
 
 
 def _map_members(rule: Callable) -> Callable:
-    """The rule of an operation for all members, made of its rule for one member."""
+    """The rule of an operation for all members, from its rule for one member."""
 
     def rule_of_all(*xs):
-        rows = share_rows(*xs)
+        rows = broadcast_members(*xs)
         return np.stack([rule(*(x[m] for x in rows)) for m in range(len(rows[0]))])
 
     return rule_of_all
@@ -240,7 +240,7 @@ def _dynamic_update_slice(**_):
 
 
 def _window_places(shape, indices, sizes, of_index, batching, of_batch, mode) -> tuple[tuple, Any]:
-    """The places in an array of windows of these sizes, behind the axes of the `indices`; and which lie within."""
+    """The index arrays of windows of `sizes` in an array of this `shape`, and a mask of those that lie inside it."""
     batch, k, places, inside = indices.shape[:-1], len(shape), [], np.array(True)
     for d, (whole, size) in enumerate(zip(shape, sizes, strict=True)):
         start = np.zeros(batch, int)
@@ -299,13 +299,13 @@ def _scan(jaxpr, length: int, num_consts: int, num_carry: int, reverse: bool, **
             carry, more = results[:num_carry], results[num_carry:]
             rows.append(more)
         columns = zip(*(rows[::-1] if reverse else rows), strict=True)
-        return [*carry, *(np.stack(share_rows(*column), axis=1) for column in columns)]
+        return [*carry, *(np.stack(broadcast_members(*column), axis=1) for column in columns)]
 
     return rule
 
 
 def _less_in_order(**_):
-    """x < y where −0 is less than 0, and NaN is more than all."""
+    """Rule of the total order x < y, in which −0 is less than 0 and NaN is greater than all numbers."""
 
     def rule(x, y):
         between = np.signbit(x) & ~np.signbit(y) & (x == y)
@@ -342,14 +342,14 @@ _RULES: dict[str, Callable] = {
 }
 
 
-def share_rows(*arrays) -> list[np.ndarray]:
-    """The arrays, all with as many rows as the longest."""
+def broadcast_members(*arrays) -> list[np.ndarray]:
+    """The arrays, broadcast along the member axis to the length of the longest."""
     rows = max(map(len, arrays), default=1)
     return [x if len(x) == rows else np.broadcast_to(x, (rows, *x.shape[1:])) for x in arrays]
 
 
 def call_host(host: Callable, shapes, *arrays) -> tuple:
-    """Call `host` on NumPy arrays, in a callback of what XLA compiles; `shapes` are those of its results."""
+    """Call `host` with NumPy arrays from XLA code; `shapes` are those of its results."""
 
     # Not `jax.pure_callback`: it puts its arguments on the device once more and waits for that, on the threads that
     # the callbacks themselves may occupy.

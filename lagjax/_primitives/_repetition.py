@@ -1,13 +1,13 @@
-"""`Repetition`: a step that is repeated as often as there are rows, on the host, with loops for its derivatives.
+"""`Repetition`: a step repeated once per row of data, evaluated on the host, with loops for its derivatives.
 
-With R the step, (x, c) ↦ c behind it, and J the derivative of all rounds, four primitives are loops,
+The step R maps (x, c) to the next carry c; J is the Jacobian of the whole loop by x and c₀. Four primitives are loops,
 
     value      c₀ ↦ c₁ ↦ … ↦ cₙ
     forward    J v                          linear in v, transposed: back
     back       Jᵀ w, from cₙ on             linear in w, transposed: forward
-    turn       (∂/∂x Jᵀ w) d + Jᵀ dw        linear in d and dw, symmetric in d
+    hessian    (∂/∂x Jᵀ w) d + Jᵀ dw        linear in d and dw, symmetric in d: the derivative of back
 
-and their derivatives are these again, of the step R′: (x, δx; c, δc) ↦ (R, DR (δx, δc)). A round is traced once, and
+and their derivatives are the same four of the step R′: (x, δx; c, δc) ↦ (R, DR (δx, δc)). A round is traced once, and
 NumPy evaluates it for all members: XLA would compile a loop for a second, and its derivatives for three.
 """
 
@@ -27,10 +27,11 @@ from lagjax._primitives._on_host import HostFunction, call_host
 
 
 class Repetition:
-    """`step(x, carry, still, row)` → (carry, of the round, parts of sums), lists of arrays; it is known by identity.
+    """A loop of `step(x, carry, still, row)` → (carry, record of the round, summands), each a list of arrays.
 
-    `inputs`, `carried`, `rows` and `fixed` count the arrays x, of the carry, of rows and of those that stay. `of_round`
-    and `sums` are shapes of doubles: what is recorded in each round, and what is summed over all.
+    `inputs`, `carried`, `rows` and `fixed` count the arrays x, in the carry, in a row, and in `still`, which have no
+    derivative. `of_round` and `sums` are the shapes of the float64 records of each round, and of the sums over all
+    rounds. Two repetitions are equal only if they are one object.
     """
 
     def __init__(self, step: Callable, inputs: int, carried: int, of_round: tuple, sums: tuple, rows=1, fixed=0):
@@ -38,17 +39,17 @@ class Repetition:
         self.rows, self.fixed, self.results = rows, fixed, carried + len(of_round) + len(sums)
 
     def __call__(self, x: tuple, first: tuple, rows: tuple, count) -> list[list]:
-        """The last carry, what was written down (N, …), and the sums, of the first `count` of the rows (N, …)."""
+        """The last carry, the records (N, …) and the sums over the first `count` of the N rows."""
         found = value_p.bind(*x, *first, *rows, count, of=self, axes=())
         return self.split_results(found)
 
     def split_results(self, found) -> list[list]:
-        """The last carry, what was written down, and the sums."""
+        """The flat results as three lists: last carry, records, sums."""
         return _split(found, self.carried, len(self.of_round))
 
     @functools.lru_cache(maxsize=16)  # noqa: B019  # those of a few
-    def hold_still(self, varies: tuple[bool, ...]) -> "Repetition":
-        """The repetition whose x are only those that vary; the others come first among what is still."""
+    def restrict_inputs(self, varies: tuple[bool, ...]) -> "Repetition":
+        """The repetition in which only those x that vary are inputs; the rest precede the arrays `still`."""
 
         def step(x, carry, still, row):
             moving, others = iter(x), iter(still)
@@ -60,7 +61,7 @@ class Repetition:
 
     @functools.cached_property
     def tangent(self) -> "Repetition":
-        """The repetition of R′, with x, δx side by side, and so the others."""
+        """The repetition of R′, whose lists of arrays are those of R followed by their tangents."""
 
         def step(x, carry, still, row):
             (x, dx), (carry, dcarry) = _split_halves(x), _split_halves(carry)
@@ -71,29 +72,29 @@ class Repetition:
         return Repetition(step, *doubled, self.rows, self.fixed)
 
     @functools.lru_cache(maxsize=8)  # noqa: B019  # those of a few
-    def _trace_round(self, shapes: tuple, goes_back: bool) -> HostFunction:
-        """A round, or the cotangents of its x and carry, for arrays of these shapes."""
+    def _trace_round(self, shapes: tuple, is_backward: bool) -> HostFunction:
+        """One round for arrays of these shapes or, with `is_backward`, its cotangents of x and carry."""
 
         def pull(x, carry, still, row, cotangents):
             return jax.vjp(lambda x, carry: list(self.step(x, carry, still, row)), x, carry)[1](cotangents)
 
         arrays = [jax.ShapeDtypeStruct(shape, float) for shape in shapes]
         *given, cotangents = _split(arrays, self.inputs, self.carried, self.fixed, self.rows)
-        if goes_back:
+        if is_backward:
             return HostFunction(pull, *given, self.split_results(cotangents))
         return HostFunction(self.step, *given)
 
-    def _round(self, *parts, goes_back: bool = False) -> Callable:
+    def _round(self, *parts, is_backward: bool = False) -> Callable:
         x, first, still, rows, *more = parts
         shapes = [a.shape[1:] for a in (*x, *first, *still)] + [row.shape[2:] for row in rows]
         for last, written, sums in more:
             shapes += [a.shape[1:] for a in last] + [a.shape[2:] for a in written] + [a.shape[1:] for a in sums]
-        return self._trace_round(tuple(shapes), goes_back)
+        return self._trace_round(tuple(shapes), is_backward)
 
     # The arrays of NumPy that follow have members in front, or one row that all share.
 
     def run(self, x, first, still, rows, count, keeps: bool = False) -> list:
-        """The results of all rounds; if it `keeps` them, the carries before each and no more."""
+        """The results of all rounds for all members; with `keeps` instead the carry before each round."""
         go, length = self._round(x, first, still, rows), rows[0].shape[1]
         members = max(map(len, (*x, *first, *still, *rows, count)))
         carry = [np.repeat(c, members // len(c), axis=0) for c in first]
@@ -101,8 +102,8 @@ class Repetition:
         written = [np.zeros((members, length, *shape)) for shape in of_round]
         sums = [np.zeros((members, *shape)) for shape in self.sums]
         for i, some in _round_members(count, members):
-            before = _pick(carry, some)
-            found = go(*_pick(x, some), *before, *_pick(still, some), *_pick(rows, some, i))
+            before = _take(carry, some)
+            found = go(*_take(x, some), *before, *_take(still, some), *_take(rows, some, i))
             behind, new, parts = self.split_results(found)
             for arrays, values in ((written, before if keeps else new), (carry, behind)):
                 for kept, a in zip(arrays, values, strict=True):
@@ -111,17 +112,27 @@ class Repetition:
                 total[some] += a
         return written if keeps else [*carry, *written, *sums]
 
-    def go_back(self, x, first, still, rows, count, cotangents) -> list:
-        """The cotangents of x and of the first carry."""
+    def run_backward(self, x, first, still, rows, count, cotangents) -> list:
+        """The cotangents of x and of the first carry, from those of the results, by the rounds in reverse order."""
         before = self.run(x, first, still, rows, count, keeps=True)
         last, written, sums = split = self.split_results(cotangents)
-        go = self._round(x, first, still, rows, split, goes_back=True)
+        go = self._round(x, first, still, rows, split, is_backward=True)
         members = max(map(len, (*x, *first, *still, *rows, count, *cotangents)))
         x_ct = [np.zeros((members, *a.shape[1:])) for a in x]
         carry_ct = [np.repeat(ct, members // len(ct), axis=0) for ct in last]
         for i, some in reversed(_round_members(count, members)):
-            given = *_pick(x, some), *_pick(before, some, i), *_pick(still, some), *_pick(rows, some, i)
-            found = go(*given, *_pick(carry_ct, some), *_pick(written, some, i), *_pick(sums, some))
+            given = (
+                *_take(x, some),
+                *_take(before, some, i),
+                *_take(still, some),
+                *_take(rows, some, i),
+            )
+            found = go(
+                *given,
+                *_take(carry_ct, some),
+                *_take(written, some, i),
+                *_take(sums, some),
+            )
             more, behind = _split(found, self.inputs)
             for total, a in zip(x_ct, more, strict=True):
                 total[some] += a
@@ -131,14 +142,14 @@ class Repetition:
 
 
 def _round_members(count, members: int) -> list[tuple]:
-    """The rounds, and which members have each: a slice where all have."""
+    """For each round the members that execute it (their `count` is larger): a slice for all, or an index array."""
     count = np.broadcast_to(count, members)
     of_all = range(int(count.max(initial=0)))
     return [(i, slice(None) if (i < count).all() else np.flatnonzero(i < count)) for i in of_all]
 
 
-def _pick(arrays, some, i=slice(None)) -> list:
-    """The rows of some members, at round i where it is a number; the one row where all members share it."""
+def _take(arrays, some, i=slice(None)) -> list:
+    """The arrays of some members, at round i if it is given; an array with one row is shared by all members."""
     return [x[some, i] if len(x) > 1 else x[:, i] for x in arrays] if isinstance(i, int) else [
         x[some] if len(x) > 1 else x for x in arrays
     ]  # fmt: skip
@@ -158,13 +169,13 @@ def _split(arrays, *sizes: int) -> list[list]:
 
 
 def _split_arguments(given, of: Repetition) -> list:
-    """x, the first carry, what is still, the rows, the count, and what follows."""
+    """The flat arguments as lists: x, first carry, `still`, rows, count, and what follows (tangents, cotangents)."""
     x, first, still, rows, (count, *along) = _split(given, of.inputs, of.carried, of.fixed, of.rows)
     return [x, first, still, rows, count, along]
 
 
 def _run_members(*given, function, of: Repetition, axes: tuple, **_):
-    """`function` of all members, in front of which some arrays have these axes."""
+    """Results of `function` for all members; `axes` tells which arguments have which batch axes."""
     batch, shapes = _drop_batch(given, axes)
     rows = [
         _member_rows(np.asarray(x), batch, [of_level[j] for of_level in reversed(axes)], shape)
@@ -175,7 +186,7 @@ def _run_members(*given, function, of: Repetition, axes: tuple, **_):
 
 
 def _member_rows(x, batch: tuple, places: list, shape: tuple):
-    """An array with one row a member; with one for all where it has no axis of these."""
+    """The array with one row per member of all batch axes, or with one row if it has none of these axes."""
     if all(place is None for place in places):
         return x[None]
     wide = [1 if place is None else size for place, size in zip(places, batch, strict=True)]
@@ -187,15 +198,15 @@ def _evaluate_forward(of, x, first, still, rows, count, along):
     return _later_halves(of.tangent.run([*x, *dx], [*first, *dfirst], still, rows, count), of.tangent)
 
 
-def _evaluate_turn(of, x, first, still, rows, count, along):
+def _evaluate_hessian(of, x, first, still, rows, count, along):
     cts, dx, dfirst, dcts = _split(along, of.results, of.inputs, of.carried)
     doubled = _interleave(of, dcts, cts)
-    found = of.tangent.go_back([*x, *dx], [*first, *dfirst], still, rows, count, doubled)
+    found = of.tangent.run_backward([*x, *dx], [*first, *dfirst], still, rows, count, doubled)
     return _first_halves(found, of)
 
 
 def _interleave(of: Repetition, first, second) -> list:
-    """Results of a repetition of R′ from those for R and those for the tangents."""
+    """Flat cotangents of the results of R′ from those of R's results and those of their tangents."""
     parts = zip(of.split_results(first), of.split_results(second), strict=True)
     return [a for both in parts for some in both for a in some]
 
@@ -222,11 +233,11 @@ def _vary_value(primals, tangents, _, *, of: Repetition, axes: tuple):
 
     moving = [ad.instantiate_zeros(t) for t in push(tangents)]
     axes = tuple((*sort(of_level), *push(of_level)) for of_level in axes)
-    return forward_p.bind(*sort(primals), *moving, of=of.hold_still(varies), axes=axes, linear=len(moving))
+    return forward_p.bind(*sort(primals), *moving, of=of.restrict_inputs(varies), axes=axes, linear=len(moving))
 
 
 def _vary_forward(primals, tangents, *, of: Repetition, axes: tuple, linear: int):
-    """J(x) v along (dx, dv): what belongs to v in the derivative of R′ at (x, v), along these."""
+    """The tangent of J(x) v along (dx, dv): the tangent part of `forward` of R′ at (x, v) along both."""
 
     def double(given, moved):
         x, first, still, rows, count, v = _split_arguments(given, of)
@@ -246,11 +257,11 @@ def _vary_back(primals, tangents, *, of: Repetition, axes: tuple, linear: int):
 
     axes = tuple(tuple(extend(of_level, of_level)) for of_level in axes)
     size = of.inputs + of.carried + of.results
-    return turn_p.bind(*extend(primals, tangents), of=of, axes=axes, linear=size)
+    return hessian_p.bind(*extend(primals, tangents), of=of, axes=axes, linear=size)
 
 
-def _vary_turn(primals, tangents, *, of: Repetition, axes: tuple, linear: int):
-    """It along all at once: what belongs to x in `turn` of R′ at (x, dx) and (dw, w), along what these vary."""
+def _vary_hessian(primals, tangents, *, of: Repetition, axes: tuple, linear: int):
+    """The tangent of `hessian` along all arguments: the x part of `hessian` of R′ at (x, dx), cotangents (dw, w)."""
 
     def double(given, moved):
         x, first, still, rows, count, along = _split_arguments(given, of)
@@ -261,16 +272,16 @@ def _vary_turn(primals, tangents, *, of: Repetition, axes: tuple, linear: int):
         return [*at, *ex, *edx, *efirst, *edfirst, *_interleave(of, edcts, ects)]
 
     axes = tuple(tuple(double(of_level, of_level)) for of_level in axes)
-    found = turn_p.bind(*double(primals, tangents), of=of.tangent, axes=axes, linear=2 * linear)
+    found = hessian_p.bind(*double(primals, tangents), of=of.tangent, axes=axes, linear=2 * linear)
     return _first_halves(found, of)
 
 
 class _RepeatedMap(LinearMap):
-    """A loop; of each axis of a batch, the first one innermost, `axes` says which arrays have it."""
+    """A loop as a primitive; `axes` has, for each batch axis, innermost first, 0 or None for every argument."""
 
     def __init__(self, name: str, shapes: Callable, function: Callable, vary: Callable, pull: Callable | None = None):
         def transpose(known, cotangents, moving, *, axes: tuple, linear: int, of: Repetition):
-            """The cotangents, summed over those axes that what moves does not have."""
+            """The cotangents, summed over the batch axes that the linear arguments lack."""
             assert pull is not None
             size = len(known)
             known_axes = [(*of_level[:size], *[0] * len(cotangents)) for of_level in axes]
@@ -306,7 +317,7 @@ class _RepeatedMap(LinearMap):
 
 
 def _drop_batch(given, axes: tuple) -> tuple[tuple[int, ...], list[tuple[int, ...]]]:
-    """The axes of a batch, the outermost one first, and the shapes of arrays without them."""
+    """The sizes of the batch axes, outermost first, and the shapes of the arguments without them."""
     shapes, batch = [x.shape for x in given], []
     for of_level in reversed(axes):
         batch.append(next(shape[0] for shape, axis in zip(shapes, of_level, strict=True) if axis == 0))
@@ -331,19 +342,19 @@ def _pull_back(given, of: Repetition, axes):
     return forward_p.bind(*given, of=of, axes=tuple(axes), linear=of.inputs + of.carried)
 
 
-def _pull_turn(given, of: Repetition, axes):
-    """The transpose of `turn`: it is symmetric in dx, and the transpose of J(x)ᵀ dw is J(x)."""
+def _pull_hessian(given, of: Repetition, axes):
+    """The transpose of `hessian`: `hessian` itself in d, by symmetry, and J(x) in dw."""
     size = of.inputs + of.carried
     known, cts, moved = _split(given, size + of.fixed + of.rows + 1, of.results)
     still = list(map(jnp.zeros_like, cts))
     count = len(known) + of.results
     wide = tuple((*of_level, *of_level[len(known) : count]) for of_level in axes)
-    of_x = turn_p.bind(*given, *still, of=of, axes=wide, linear=size + of.results)
+    of_x = hessian_p.bind(*given, *still, of=of, axes=wide, linear=size + of.results)
     narrow = [(*of_level[: len(known)], *of_level[count:]) for of_level in axes]
     return [*of_x, *_pull_back([*known, *moved], of, narrow)]
 
 
 value_p = _RepeatedMap("value", _shapes, lambda of, *x: of.run(*x[:-1]), _vary_value)
 forward_p = _RepeatedMap("forward", _shapes, _evaluate_forward, _vary_forward, _pull_forward)
-back_p = _RepeatedMap("back", _back_shapes, lambda of, *x: of.go_back(*x), _vary_back, _pull_back)
-turn_p = _RepeatedMap("turn", _back_shapes, _evaluate_turn, _vary_turn, _pull_turn)
+back_p = _RepeatedMap("back", _back_shapes, lambda of, *x: of.run_backward(*x), _vary_back, _pull_back)
+hessian_p = _RepeatedMap("hessian", _back_shapes, _evaluate_hessian, _vary_hessian, _pull_hessian)

@@ -1,20 +1,23 @@
-"""Scalar programs: straight lines of operations on numbers, their derivatives, series and pieces; it knows no JAX.
+"""Scalar programs: functions written as straight-line sequences of scalar operations, and transformations of them.
 
-    graph of scalars ──_graph──►  folded, shared  ──_passes──►  StraightLine  ──_series, _borders──►  machine code
+    graph of scalars ──_graph──►  simplified  ──_passes──►  StraightLine  ──_series, _borders──►  machine code
 
-`_operations` has a row for each operation: its value, its derivatives, its series. `_graph` shares and, by `_simplify`,
-folds; `_passes` finish it; `_differentiation` differentiates it. Series: `_series`, with `_recurrences` for operations
-that have one of their own. Pieces: `_deciding` (what decides), `_decisions` (by which numbers), `_cones` (of lengths),
-`_levels` (their borders), `_beginnings` (where a motion begins), `_borders` (all of that), `_sliding` (along them, by
-`_border_forces`, `_held` and `_small_equations`), `_jump` and `_kick` (over them, by `_jump_search`), `_features` and
-`_powers` (where no series helps), `_look_ups` (tables). A program consists of a `_line`, with its values in
-NumPy; `_rounding` is for their error, `_formulas` for readers. `_memory` bounds what a graph may take. What JAX traces
-becomes a graph in `_tracing`.
+This room does not import JAX; `_tracing` translates what JAX traces into graphs. A *decision* is a piecewise operation
+(`sign`, `floor`, …), its *switching number* is the scalar that it depends on, a *piece* is the result of the decision,
+constant between two *borders*, and a *kick* is a jump of velocities at a border.
+
+`_operations` has a row for each operation (value, derivatives, series). `_graph` shares equal nodes and simplifies them
+by `_simplify`; `_passes` rewrites whole graphs; `_differentiation` differentiates. Series: `_series`, `_recurrences`.
+Decisions: `_deciding` (which nodes), `_decisions` (their rewriting), `_cones` (lengths), `_levels` (guards),
+`_beginnings` (pieces at the start), `_borders` (all of it), `_sliding` with `_border_forces`, `_held` and
+`_small_equations` (motion along a border), `_jump` and `_kick` with `_jump_search` (crossing one), `_features` and
+`_powers` (functions that a series misses), `_look_ups` (tables). `_line` evaluates in NumPy, `_rounding` bounds
+rounding errors, `_formulas` writes text, `_memory` bounds memory.
 """
 
 from lagjax._program._borders import (
     Borders,
-    Pieced,
+    PiecedProgram,
     borders,
     distances,
     find_corners,

@@ -1,4 +1,4 @@
-"""On which pieces a motion begins, and how far a state is from their borders."""
+"""The pieces on which a motion begins, and the distances of a state from the borders of its pieces."""
 
 from collections.abc import Callable, Sequence
 
@@ -12,12 +12,12 @@ from lagjax._program._series import StraightLine
 from lagjax._program._small_equations import dot
 
 
-def copy_deciding(
+def copy_with_pieces(
     graph: Graph, line: StraightLine, first: int, decisions: Sequence[Decision], decide: Callable | None = None
 ) -> list[int]:
-    """The nodes of a line with pieces, its inputs from number `first` on, in a graph.
+    """Copy a line with pieces into a graph; its inputs from `first` on, the pieces, are computed from the state.
 
-    Piece j is that of its switching number, or `decide(j, piece, nodes)` of the piece that it is as it is written.
+    Piece j is that of its switching number, or `decide(j, piece, nodes)` with that piece. Returns the ids.
     """
 
     def find_input(i: int, nodes: list[int]) -> int | None:
@@ -30,13 +30,13 @@ def copy_deciding(
 
 
 def signed_distances(line: StraightLine, first: int, decisions: Sequence[Decision], turning: bool) -> StraightLine:
-    """The differences of all switching numbers from the nearest border of their piece; of the inputs but the pieces.
+    """The line from the inputs without pieces to the signed distances of switching numbers from their nearest borders.
 
-    They are positive on one side of each border or, `turning`, of every other one.
+    A distance is positive on the upper side of each border or, with `turning`, of every second one.
     """
     graph, results = Graph(LARGEST_REWRITING * len(line.nodes) + 1000), []
     f, number = graph.apply, graph.number
-    places = copy_deciding(graph, line, first, decisions)
+    places = copy_with_pieces(graph, line, first, decisions)
     for decision in decisions:
         x = places[decision.switch]
         if decision.kind != SIGN:
@@ -52,11 +52,11 @@ def signed_distances(line: StraightLine, first: int, decisions: Sequence[Decisio
 
 
 def decide_pieces(decided: DecidedProgram, slides: Sequence[Slide]) -> StraightLine:
-    """The pieces, from the inputs, the pieces before, and a flag for each that is to stay; those of `slides` are last.
+    """The line that decides the pieces at the start of a motion; outputs are the pieces, then the flags of `slides`.
 
-    A motion that begins on a border slides along it, and leaves it at once where it may; on one that depends on
-    positions it has to be at rest. To begin with all of several borders takes few turns until it is known which ones it
-    leaves. A slide continues.
+    Inputs are those of the program, a proposed value for each piece and flag, and a 1 for each that must keep it. A
+    motion that begins on a border slides along it, or leaves it at once if a side allows it; on a border by position it
+    must be at rest. With several borders, some repetitions find which of them it leaves. A slide in progress continues.
     """
     graph, count = Graph(2 * LARGEST_REWRITING * len(decided.line.nodes) + 2000), len(decided.decisions)
     f, zero, one = graph.apply, graph.number(0.0), graph.number(1.0)
@@ -66,11 +66,11 @@ def decide_pieces(decided: DecidedProgram, slides: Sequence[Slide]) -> StraightL
     def decide_or_keep(j: int, piece: int, _) -> int:
         return f("select", stays[j], piece, given[j])
 
-    nodes = copy_deciding(graph, decided.line, decided.first, decided.decisions, decide_or_keep)
+    nodes = copy_with_pieces(graph, decided.line, decided.first, decided.decisions, decide_or_keep)
     pieces, flags = [nodes[i] for i in decided.pieces], []
     for slide, flag in zip(slides, given[count : count + len(slides)], strict=True):
         j, piece = slide.piece, pieces[slide.piece]
-        begins, below = _begin_on_border(decided, graph, nodes, slide, piece)
+        begins, below = _test_border_start(decided, graph, nodes, slide, piece)
         if begins is None:  # it begins on one side, and meets the other one at once
             flags.append(flag)
             continue
@@ -78,7 +78,7 @@ def decide_pieces(decided: DecidedProgram, slides: Sequence[Slide]) -> StraightL
             begins = f("and", begins, f("not", stays[j]))
         if slide.order > 1:
             begins = f("and", begins, f("eq", _switching_rate(decided, graph, nodes, j), zero))
-        for k in _find_bends(decided, slide):  # which are passed where what bends u has a rate
+        for k in _find_sign_decisions(decided, slide):  # which are passed where what bends u has a rate
             rests = f("eq", _switching_rate(decided, graph, nodes, k), zero)
             begins = f("and", begins, f("or", rests, f("ne", nodes[decided.pieces[k]], zero)))
         flags.append(f("select", begins, flag, one))
@@ -90,8 +90,8 @@ def decide_pieces(decided: DecidedProgram, slides: Sequence[Slide]) -> StraightL
     return eliminate_dead_code(graph, pieces + flags)
 
 
-def _begin_on_border(decided: DecidedProgram, graph: Graph, nodes: list[int], slide: Slide, piece: int):
-    """True where a switching number is on a border of its piece, None if that is not asked; and the piece below it."""
+def _test_border_start(decided: DecidedProgram, graph: Graph, nodes: list[int], slide: Slide, piece: int):
+    """The flag that a motion starts on a border of `piece` (None if not tested), and the piece below that border."""
     f, decision, below = graph.apply, decided.decisions[slide.piece], graph.number(-1.0)
     if decision.kind in (SIGN, CONE):
         return f("le" if slide.parts else "eq", piece, graph.number(0.0)), below
@@ -102,15 +102,15 @@ def _begin_on_border(decided: DecidedProgram, graph: Graph, nodes: list[int], sl
     return f("or", at_lower, at_upper), f("select", at_upper, lower, piece)
 
 
-def _find_bends(decided: DecidedProgram, slide: Slide) -> list[int]:
-    """The pieces of signs that the switching number of a border by position depends on."""
+def _find_sign_decisions(decided: DecidedProgram, slide: Slide) -> list[int]:
+    """The sign decisions on which the switching number of a border by position depends."""
     below = find_ancestors(decided.line.nodes, [decided.decisions[slide.piece].switch]) if slide.order > 1 else []
     signs = (k for k, decision in enumerate(decided.decisions) if decision.kind == SIGN)
     return [k for k in signs if decided.pieces[k] in below]
 
 
 def _switching_rate(decided: DecidedProgram, graph: Graph, nodes: list[int], j: int) -> int:
-    """u̇ of the switching number of piece j, in a graph in which the nodes of the program are `nodes`."""
+    """The node of the rate u̇ of switching number j; the nodes of the program have the ids `nodes` in the graph."""
     n = decided.n
     slopes = gradient_in(graph, decided.line, nodes, decided.decisions[j].switch, range(2 * n + 1))
     return graph.apply("add", dot(graph, slopes[:n], [graph.input(n + i, "float") for i in range(n)]), slopes[2 * n])

@@ -1,4 +1,4 @@
-"""The effect of pieces on the right side of A z = r, each for itself, between both sides of its border."""
+"""The force that each sliding border exerts: the change of r in A z = r between the two sides of the border."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -20,12 +20,12 @@ _TINY = 2.0**-300
 
 
 class Slide(NamedTuple):
-    """Borders to slide along: those of piece number `piece`. Of its switching number u the rate of this order is zero.
+    """A border to slide along, of piece number `piece`: the rate of its switching number u of this `order` stays zero.
 
-    Order 1 is that of a border that depends on velocities, 2 that of one that does not. While the motion slides the
-    piece is the one below, and the one above is larger by `width`. `level(graph, piece)` is that of u between them.
+    The order is 1 for a border that depends on velocities, 2 for one by position. While the motion slides, the piece is
+    the lower one; the upper one is larger by `width`. `level(graph, piece)` is the level of u between them.
 
-    Of a cone u is the length of a vector of `parts`, all of which stay zero: dry friction in the plane.
+    For a cone, u is the length of a vector of `parts`, all of which stay zero: dry friction in the plane.
     """
 
     piece: int
@@ -36,7 +36,7 @@ class Slide(NamedTuple):
 
 
 class Row(NamedTuple):
-    """A number that stays zero: of border number `slide`, from the middle of both sides by `below` on the lower one."""
+    """A number `offset` that stays zero on border number `slide`; `below` is the value of μ on the lower side."""
 
     slide: int
     offset: int
@@ -44,9 +44,9 @@ class Row(NamedTuple):
 
 
 class SlidingRows(NamedTuple):
-    """The numbers that stay zero while a motion slides, `rows` of them; those of each slide are `of_slides`.
+    """The `rows`, numbers that stay zero while a motion slides; `of_slides` has the range of rows of each slide.
 
-    `pieces` are those of the slides, and `flags` are true where the motion slides.
+    `pieces` are the nodes of the pieces of the slides, and `flags` are true where the motion slides.
     """
 
     graph: Graph
@@ -61,7 +61,7 @@ class SlidingRows(NamedTuple):
     def from_slides(
         cls, line: StraightLine, n: int, first: int, switches: Sequence[int], slides: Sequence[Slide]
     ) -> "SlidingRows":
-        """Those of a program whose pieces, of these switching numbers, are its inputs from the `first` one on."""
+        """The rows of a program whose pieces are inputs from `first` on, with the switching numbers `switches`."""
         graph, rows, of_slides = Graph.from_line(line, LARGEST_SLIDING), [], []
         pieces = [graph.input(first + slide.piece, "float") for slide in slides]
         for k, (slide, piece) in enumerate(zip(slides, pieces, strict=True)):
@@ -83,7 +83,7 @@ class SlidingRows(NamedTuple):
         return [[of_rows[m] for m in rows] for rows in self.of_slides]
 
     def rate(self, k: int) -> tuple[Sparse, int, int]:
-        """∂w/∂q̇ and −∂w/∂q q̇ − ∂w/∂t of what is to stay zero, u or u̇. And w."""
+        """For row k, with w = u or u̇ the quantity that stays zero: ∂w/∂q̇ (sparse), −∂w/∂q q̇ − ∂w/∂t, and w."""
         graph, n, node = self.graph, self.n, self.rows[k].offset
         level, slopes = node, {}
         for _ in range(self.order(k)):
@@ -97,9 +97,9 @@ class SlidingRows(NamedTuple):
         return by_velocity, graph.apply("neg", node), level
 
     def _nodes_of_sides(self, row: Row) -> tuple[dict[int, int], dict[int, int], float]:
-        """The nodes that take the place of others below and above a border, and what part of the difference μ counts.
+        """Replacements {node: node} for the lower and upper side of a border, and the factor of μ in their difference.
 
-        Of a cone they are where its vector is zero and rests, and where it is tiny and has one part alone.
+        For a cone the sides are: its vector zero and at rest, and its vector tiny with one component only.
         """
         slide, piece, number = self.slides[row.slide], self.pieces[row.slide], self.graph.number
         if slide.parts:
@@ -110,7 +110,7 @@ class SlidingRows(NamedTuple):
         return {}, {piece: self.graph.apply("add", piece, number(1.0))}, 0.5
 
     def find_forces(self, linear: LinearSystem) -> list[Sparse] | None:
-        """∂r/∂μₖ, entry by entry; None where pieces act on more than the right side."""
+        """The sparse vectors ∂r/∂μₖ of all rows; None if pieces act on more than the right side of A z = r."""
         graph, right = self.graph, linear.right
         matrix = *linear.entries.values(), *linear.others.values(), *linear.factors
         if not set(self.pieces).isdisjoint(graph.find_ancestors(matrix)):
@@ -133,11 +133,11 @@ class SlidingRows(NamedTuple):
             acts.append(act)
         return acts
 
-    def bends(self, right: Sequence[int], acts: Sequence[Sparse], decided: range) -> bool:
-        """True if between both sides of a border r is not on their chord, at random numbers, pieces among them.
+    def is_nonlinear(self, right: Sequence[int], acts: Sequence[Sparse], decided: range) -> bool:
+        """True if r is not affine in a piece between the two sides of its border, tested at random numbers.
 
-        So it is where two frictions change each other's normal forces, and not in proportion. What one holds at rest,
-        between both sides, then says nothing about the other.
+        So it is where two friction forces change each other's normal forces nonlinearly. Then the value that one takes
+        at rest, between both sides, does not determine the second.
         """
         graph, draw, line = self.graph, np.random.default_rng(0), eliminate_dead_code(self.graph, right)
         if any(op in LOOK_UPS for op, *_ in line.nodes):

@@ -1,10 +1,10 @@
-"""The borders of a program: where its motion leaves one piece for the next.
+"""The borders of a program, where its motion passes from one piece to the next, in one object.
 
-decisions   the program with pieces, and its narrow features (`_decisions`, `_features`)
+decisions   the program with its pieces as inputs, and its narrow features (`_decisions`, `_features`)
 kicks       the pieces with which L jumps (`_kick`)
-slides      the borders that the motion may slide along, and the program that does so (`_sliding`)
-guards      the borders of all pieces (`_levels`)
-decide      the pieces of a state where a motion begins (`_beginnings`)
+slides      the borders along which the motion may slide, and the program of that motion (`_sliding`)
+guards      the borders of all pieces as inequalities (`_levels`)
+decide      the pieces of a state where a motion starts (`_beginnings`)
 """
 
 import functools
@@ -23,7 +23,7 @@ from lagjax._program._differentiation import copy_nodes, pullback
 from lagjax._program._features import UP_TO, Feature
 from lagjax._program._graph import Graph, find_ancestors
 from lagjax._program._jump_search import JumpSearch
-from lagjax._program._kick import Kick, find_kicking, kick_of
+from lagjax._program._kick import Kick, build_kick, find_kicking_pieces
 from lagjax._program._levels import CLOCK, CONE, SIGN, SLIDE, Decision, Guard, list_guards
 from lagjax._program._look_ups import Table
 from lagjax._program._passes import eliminate_dead_code
@@ -36,8 +36,8 @@ _WITHOUT_ANY = {"input", "constant", "add", "sub", "neg", "sin", "cos"}  # no pi
 
 
 @dataclass(frozen=True, eq=False)
-class Pieced:
-    """A program that takes its pieces as its last inputs, or only some of the numbers of a member (`Recurrent`)."""
+class PiecedProgram:
+    """A program whose last inputs are its pieces, or one that takes only some of its parameters (`Recurrent`)."""
 
     line: StraightLine
     size: int
@@ -47,17 +47,17 @@ class Pieced:
 
 
 class Borders(NamedTuple):
-    """The borders of a program with m pieces, and its features.
+    """The borders of a program with m pieces, and its narrow features.
 
-    `program` takes the inputs, then the pieces; `decisions` (m,) say what each is decided by, and `arguments` are the
-    nodes of those of `features`, of which alike ones stand side by side. `decide` takes the same and then m flags: it
-    gives the pieces of a state, or the piece that is given where the flag is 1. `nested` says whether switching numbers
-    depend on pieces; those of a `CLOCK` have no guards. `motion` has the borders of the motion alone, where this is one
-    with tangents (`_jump.with_borders_of_tangents`). `kick` is that at borders at which L jumps, None where there are
-    none; `holding` is what keeps the motion on the borders that it slides along.
+    `program` takes the inputs, then the pieces; `decisions` (m,) define these; `arguments` are the argument nodes of
+    `features`, sorted by feature. `decide` takes the inputs, m proposed pieces and m flags: it gives the pieces of a
+    state, or the proposed ones where the flag is 1. `nested`: switching numbers depend on pieces. Pieces of a `CLOCK`
+    have no guards. `motion` has the borders of the motion alone, if this is a motion with tangents
+    (`_jump.with_borders_of_tangents`). `kick` is the kick at borders where L jumps, None without them; `holding` keeps
+    the motion on borders along which it slides.
     """
 
-    program: Pieced
+    program: PiecedProgram
     decisions: tuple[Decision, ...]
     decide: StraightLine
     guards: tuple[Guard, ...]
@@ -78,9 +78,9 @@ class Borders(NamedTuple):
 
     @property
     def groups_of_guards(self) -> list[int]:
-        """The group of each guard of a border by velocity that the motion slides along, and of its shares.
+        """For each guard of a border by velocity, or of its shares, the group of its slide; −1 for other guards.
 
-        −1 for others. Those of different groups may be crossed at one instant, in one step.
+        Guards of different groups may be crossed at one instant, in one step.
         """
         shares = [j for j, decision in enumerate(self.decisions) if decision.kind == SLIDE]
         of_shares, found = dict(zip(shares, self.holding.groups, strict=True)), []
@@ -104,7 +104,7 @@ class Borders(NamedTuple):
         return tuple(j for j, decision in enumerate(self.decisions) if decision.kind == CLOCK)
 
     def moving_table(self, j: int) -> Table | None:
-        """The table of parameters whose entries are the levels of piece j; None where it has none."""
+        """The table whose entries are the levels of piece j, if they are parameters; else None."""
         located = self.decisions[j].table
         return None if located is None or located.table.numbers is not None else located.table
 
@@ -113,16 +113,16 @@ class Borders(NamedTuple):
         return any(self.moving_table(j) is not None for j in range(len(self.decisions)))
 
     @property
-    def shaken(self) -> tuple[int, ...]:
-        """The pieces whose switching numbers may jump at the next entry of a clock, or where another piece changes."""
+    def dependent_pieces(self) -> tuple[int, ...]:
+        """The pieces whose switching number reads another piece, and may therefore jump when that piece changes."""
         nodes, first = self.program.line.nodes, self.program.size - len(self.decisions)
         decided = [j for j, decision in enumerate(self.decisions) if decision.kind != SLIDE]
         pieces = {("input", (), first + j) for j in decided}
         return tuple(j for j in decided if any(nodes[i] in pieces for i in self._below(self.decisions[j].switch)))
 
     @property
-    def abrupt(self) -> tuple[int, ...]:
-        """The nodes of what is zero where a root has no series."""
+    def root_arguments(self) -> tuple[int, ...]:
+        """The argument nodes of the features where a root has no series."""
         return tuple(u for u, of in zip(self.arguments, self.features, strict=True) if of.kind == UP_TO)
 
     @property
@@ -130,12 +130,12 @@ class Borders(NamedTuple):
         return self.switches + self.arguments
 
     def kicks_in_time(self, states: int) -> list[int]:
-        """The pieces with which L jumps whose switching numbers depend on the time alone, but no clocks."""
+        """The pieces with which L jumps whose switching number is a function of time alone, other than clocks."""
         others = (j for j in self.kicking if self.decisions[j].kind != CLOCK)
         return [j for j in others if self.read_by(self.decisions[j].switch).isdisjoint(range(states))]
 
     def read_by(self, node: int) -> frozenset[int]:
-        """The inputs that a node of the program depends on; pieces are the last ones."""
+        """The positions of the inputs on which a node of the program depends; pieces are the last inputs."""
         return inputs_below(self.program.line, [node])
 
     def _below(self, node: int) -> list[int]:
@@ -143,10 +143,10 @@ class Borders(NamedTuple):
 
 
 def borders(program: Recurrent, size: int, slides: bool = True, watched: int = 0) -> Borders | None:
-    """The borders of a program of q, q̇, t and parameters whose first `size` outputs are q̈; None where it is smooth.
+    """The borders of a program of q, q̇, t and parameters whose first `size` outputs are q̈; None if it is smooth.
 
-    Along borders that depend on velocities the motion may slide (`slides`; see `_sliding`). As many of the last outputs
-    are `watched` along the motion: what they decide on has borders too.
+    With `slides` the motion may slide along borders that depend on velocities (`_sliding`). The last `watched` outputs
+    are evaluated along the motion too: their decisions have borders as well.
     """
     with np.errstate(all="ignore"):
         found = _find_borders(program, size, slides, watched, False)
@@ -155,12 +155,12 @@ def borders(program: Recurrent, size: int, slides: bool = True, watched: int = 0
 
 
 def _find_borders(program: Recurrent, size: int, slides: bool, watched: int, beside: bool) -> Borders | None:
-    """The borders; a kick that is refused finds out whether L does not jump where steps end `beside` a border."""
+    """The borders; with `beside`, steps end next to borders of a root, and L may turn out not to jump there."""
     if (mechanics := getattr(program, "mechanics", None)) is not None:
         count = len(mechanics.outputs)
         whole = with_outputs(program, mechanics)
         decided = find_decisions(whole, size, slides, watched + count, beside)
-        if decided is not None and decided.decisions and (kicking := find_kicking(decided, count)):
+        if decided is not None and decided.decisions and (kicking := find_kicking_pieces(decided, count)):
             again = functools.partial(find_decisions, whole, size, slides, watched + count, beside)
             return _build_borders(whole, decided, slides, again, count, kicking)
     if _WITHOUT_ANY.issuperset(op for op, *_ in program.line.nodes):
@@ -173,14 +173,14 @@ def _find_borders(program: Recurrent, size: int, slides: bool, watched: int, bes
 def _build_borders(
     program: Recurrent, decided: DecidedProgram, slides: bool, again: Callable, mechanics: int, kicking: dict
 ) -> Borders:
-    """The borders of what has been decided, or is `again`, with one piece apart.
+    """The borders of a program with decisions; `again(apart=j)` finds them with both sides of piece j written.
 
-    The last outputs, `mechanics` of them, are those that a kick is made of, which the result does not have.
+    The last `mechanics` outputs are the quantities of a kick, which the result leaves out; `kicking` has its pieces.
     """
     sliding, lost = _find_slides(decided, kicking) if slides else ([], [])
     if len(lost) == 1 and len(decided.line.nodes) <= LARGEST_COPIED:
         decided = again(apart=lost[0])
-        kicking = find_kicking(decided, mechanics) if mechanics else {}
+        kicking = find_kicking_pieces(decided, mechanics) if mechanics else {}
         sliding, _ = _find_slides(decided, kicking)
     line, n, switches = decided.line, decided.n, decided.switches
     at_rest = [slide for slide in sliding if slide.order == 1]
@@ -195,26 +195,26 @@ def _build_borders(
     decisions = (*placed, *(Decision(SLIDE, share) for share in shares))
     kick = None
     if mechanics:
-        kick = kick_of(line, n, decided.first, decisions, mechanics, kicking)
+        kick = build_kick(line, n, decided.first, decisions, mechanics, kicking)
         line = line.replace(outputs=line.outputs[:-mechanics])
     pieces = [np.dtype(float)] * len(decisions)
     nested = not set(decided.pieces).isdisjoint(find_ancestors(decided.line.nodes, switches))
     return Borders(
-        Pieced(line, decided.first + len(decisions), (*program.dtypes, *pieces), linear), decisions,
+        PiecedProgram(line, decided.first + len(decisions), (*program.dtypes, *pieces), linear), decisions,
         decide_pieces(decided, some), list_guards([of_piece.kind for of_piece in decisions], some), nested,
         tuple(places[u] for u, _ in decided.features), tuple(feature for _, feature in decided.features), holding, kick,
     )  # fmt: skip
 
 
 def _find_slides(decided: DecidedProgram, kicking: Container[int]) -> tuple[list[Slide], list[int]]:
-    """The borders that a motion may slide along: those that something jumps with, but not L.
+    """The borders along which the motion may slide, and the pieces whose border is lost.
 
-    Those that depend on velocities come first, and are all there or none. And those of them that are lost, because
-    what other pieces are on their other side is not known.
+    A motion may slide where q̈ jumps but L does not. Borders by velocity come first, and all or none of them are
+    returned. A border is lost if further pieces on its far side are unknown.
     """
     line, n, decisions, pieces = decided.line, decided.n, decided.decisions, decided.pieces
     acting, orders = set(find_ancestors(line.nodes, line.outputs[:n])), {}
-    acting -= _find_undefined(decided, acting)
+    acting -= _find_undefined_sides(decided, acting)
     for j, decision in enumerate(decisions):
         jumps = decision.kind != SIGN or pieces[j] in decided.jumping
         if decision.kind != CLOCK and pieces[j] in acting and j not in kicking and jumps:
@@ -246,8 +246,8 @@ def _find_slides(decided: DecidedProgram, kicking: Container[int]) -> tuple[list
     return both if len(both) <= MOST_SLIDING else by_velocity if len(by_velocity) <= MOST_SLIDING else [], lost
 
 
-def _find_undefined(decided: DecidedProgram, acting: set[int]) -> set[int]:
-    """The pieces on one of whose sides nothing is known: `where` has NaN there."""
+def _find_undefined_sides(decided: DecidedProgram, acting: set[int]) -> set[int]:
+    """The pieces for which q̈ is NaN on one side, by a `where` with a NaN branch."""
     nodes, found = decided.line.nodes, set()
     for op, operands, _ in (nodes[i] for i in acting):
         if op == "select" and any(nodes[x][0] == "constant" and nodes[x][2] != nodes[x][2] for x in operands[1:]):
@@ -256,10 +256,10 @@ def _find_undefined(decided: DecidedProgram, acting: set[int]) -> set[int]:
 
 
 class FoundCorners(NamedTuple):
-    """The borders, P of them, at which some outputs of a program of q, q̇, t and parameters jump: `jumps` (P, outputs).
+    """The P borders at which outputs of a program of q, q̇, t and parameters jump: `jumps` is (P, outputs), bool.
 
-    `sides` takes the inputs of the program: numbers (P,) that change their sign at every such border. There an output
-    may `vanish` (P, outputs), on one side.
+    `sides` maps the inputs of the program to P numbers, each of which changes sign at its border. `vanish` (P,
+    outputs): the output is zero on one side.
     """
 
     sides: StraightLine
@@ -268,7 +268,7 @@ class FoundCorners(NamedTuple):
 
 
 def find_corners(program: Recurrent, size: int) -> FoundCorners | None:
-    """The borders that depend on positions and time, of `size` coordinates; None where no output jumps."""
+    """The borders by position and time at which outputs jump, for `size` coordinates; None if no output jumps."""
     with np.errstate(all="ignore"):
         decided = find_decisions(program, size, False, len(program.line.outputs), True)
         if decided is None:
@@ -292,16 +292,16 @@ def is_smooth(line: StraightLine) -> bool:
 
 
 def distances(found: Borders) -> StraightLine:
-    """The differences of all switching numbers from the nearest level of their piece; of the inputs but the pieces."""
+    """The line from the inputs without pieces to the distance of each switching number from its nearest level."""
     first = found.program.size - len(found.decisions)
     return signed_distances(found.program.line, first, found.decisions, turning=False)
 
 
-def with_outputs(program: Recurrent, more: StraightLine, moving: int | None = None) -> Pieced:
-    """A program with the outputs of a second line of the same inputs after its own; common operations are shared.
+def with_outputs(program: Recurrent, more: StraightLine, moving: int | None = None) -> PiecedProgram:
+    """A program with the outputs of a second line of the same inputs appended; common operations are shared.
 
-    If the first `moving` inputs are given, the rounding of each added output stands before these (`rounding`); it is
-    zero for a long line.
+    If `moving`, the number of inputs that vary, is given, the rounding errors of the added outputs (`rounding`) precede
+    them; for a long line they are zero.
     """
     graph = Graph.from_line(program.line, len(program.line.nodes) + 2 * LARGEST_REWRITING * len(more.nodes) + 1000)
     with np.errstate(all="ignore"):
@@ -312,11 +312,11 @@ def with_outputs(program: Recurrent, more: StraightLine, moving: int | None = No
     outputs = (*program.line.outputs, *errors, *(places[i] for i in more.outputs))
     line = StraightLine(tuple(graph.nodes), tuple(graph.kinds), outputs)
     mechanics = getattr(program, "mechanics", None)
-    return Pieced(line, program.size, program.dtypes, program.linear, mechanics)
+    return PiecedProgram(line, program.size, program.dtypes, program.linear, mechanics)
 
 
 def gradient(borders: Borders, by: Sequence[int]) -> StraightLine:
-    """The derivatives by the inputs `by` of Σ hⱼ uⱼ, with m numbers hⱼ after the inputs of the program."""
+    """The line of the derivatives by the inputs `by` of Σ hⱼ uⱼ, with m weights hⱼ after the inputs of the program."""
     program = borders.program
     line = eliminate_dead_code(program.line, borders.switches)
     return pullback(line, program.dtypes, by, range(len(borders.switches)))

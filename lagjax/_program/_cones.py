@@ -1,4 +1,4 @@
-"""Lengths of velocities that something is divided by: cones, the borders of dry friction in the plane."""
+"""Cones: divisions by the length |u| of a velocity vector u, singular at rest, as in dry friction in the plane."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ NO_LENGTH = 1e-12  # the longest one that a guard against zero may put in the pl
 
 
 def list_squares(line: StraightLine, i: int) -> list[int] | None:
-    """The nodes whose squares, times positive constants, node i is the sum of; None where it is no such sum."""
+    """The nodes u₁, u₂, … if node i is a sum Σ cₖ uₖ² with positive constants cₖ; None if it is not."""
     op, operands, _ = line.nodes[i]
     if op == "add":
         some = [list_squares(line, x) for x in operands]
@@ -22,7 +22,7 @@ def list_squares(line: StraightLine, i: int) -> list[int] | None:
 
 
 def velocity_degrees(line: StraightLine, size: int) -> list[int]:
-    """The degree of each node in the velocities; 2 for any that is not 0 or 1."""
+    """For each node its degree as a polynomial in the velocities: 0, 1, or 2 for anything higher or not polynomial."""
     degrees: list[int] = []
     for op, operands, attribute in line.nodes:
         of = [degrees[x] for x in operands]
@@ -36,15 +36,15 @@ def velocity_degrees(line: StraightLine, size: int) -> list[int]:
 
 
 def find_cones(line: StraightLine, size: int, linear: Any) -> dict[int, int]:
-    """The nodes by which lengths |u| of velocities that something is divided by are known, each with the node of |u|².
+    """The nodes that compute, or compare, a length |u| of velocities used as a divisor, each with the node of |u|².
 
-    These are roots, also of what `where` or `maximum` puts in the place of |u| = 0, and the comparisons of such guards.
-    What is not linear in the velocities is a force.
+    They are square roots, also of `where` or `maximum` expressions that replace |u| = 0, and the comparisons in such
+    guards. Each component of u must be linear in the velocities, and the program must solve a linear system.
     """
     nodes, cones = line.nodes, {}
 
     def guarded(i: int) -> list[int]:
-        """A node, or those that a guard chooses from."""
+        """Node i and, if it is a `select` or `max` that guards against zero, the nodes that it chooses from."""
         op, operands, _ = nodes[i]
         some = operands[1:] if op == "select" else operands if op == "max" else ()
         return [i, *(x for k in some for x in guarded(k))] if some else [i]

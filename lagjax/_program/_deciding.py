@@ -1,4 +1,4 @@
-"""The operations of a program, as it is written, that decide: those that become pieces, or near which steps end."""
+"""The decisive operations of a program, and the borders next to which steps must end instead."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -17,10 +17,10 @@ _SINGULAR_AT_ZERO, _SINGULAR_AT_ONE = ("sqrt", "rsqrt", "cbrt", "log", "pow"), (
 
 
 class Deciding(NamedTuple):
-    """The nodes of a program that decide or depend on decisions.
+    """The nodes of a program that decide, or depend on decisions.
 
-    `decisive` are those that q̈ and guards depend on, less `abrupt` ones: what is decided at a border where a root has
-    no series. `of_guards` are those of guards alone. `cones` are the nodes that lengths of velocities are known by.
+    `decisive`: nodes on which q̈ or guards depend, without the `abrupt` ones, whose border is where a root has no
+    series. `of_guards`: nodes on which guards alone depend. `cones`: nodes of lengths of velocities (`find_cones`).
     """
 
     line: StraightLine
@@ -31,9 +31,9 @@ class Deciding(NamedTuple):
 
     @classmethod
     def from_program(cls, program: Recurrent, size: int, slides: bool, watched: int, beside: bool) -> "Deciding":
-        """Those of a program whose first `size` outputs are q̈, and whose last ones are `watched`.
+        """The decisive nodes of a program whose first `size` outputs are q̈ and last `watched` outputs are guards.
 
-        Where a root is of what is chosen, steps end `beside` that border, even if the root is not zero there.
+        With `beside`, steps end next to the border of a choice under a root, even if the root is not zero there.
         """
         linear, line = program.linear, program.line
         roots = line.outputs[:size] if linear is None else [*linear.right, *linear.entries.values()]
@@ -45,11 +45,11 @@ class Deciding(NamedTuple):
         if watched:  # which may read the solution of a linear system, but not decide on its elimination
             needed |= of_guards - (set(find_ancestors(line.nodes, line.outputs[:size])) - needed)
         cones = find_cones(line, size, linear) if slides else {}
-        abrupt = cls(line, needed, set(), of_guards, cones)._find_abrupt(beside)
+        abrupt = cls(line, needed, set(), of_guards, cones)._find_abrupt_decisions(beside)
         return cls(line, needed - abrupt, abrupt, of_guards, cones)
 
-    def _find_abrupt(self, beside: bool) -> set[int]:
-        """The decisions at whose border a root has no series."""
+    def _find_abrupt_decisions(self, beside: bool) -> set[int]:
+        """The decisions at whose border a root, or another singular function, has no series."""
         nodes, needed = self.line.nodes, self.decisive
 
         def bases_of(operations):
@@ -80,7 +80,7 @@ class Deciding(NamedTuple):
         return {i for i in needed if i in out or self.compared(i) in abrupt} - self.cones.keys()
 
     def _may_vanish(self, i: int, equal: frozenset[int]) -> bool:
-        """True if a node may be zero where these numbers are `equal`, or where the only one is zero."""
+        """True if node i may be zero where the numbers `equal` are equal, or where the only one of them is zero."""
         op, operands, attribute = self.line.nodes[i]
         if op in ("input", "constant"):
             return equal == {i} or (attribute == 0.0 and op == "constant")
@@ -89,7 +89,7 @@ class Deciding(NamedTuple):
         return (all if op in ("add", "sub") else any)(self._may_vanish(x, equal) for x in operands)
 
     def compared(self, i: int) -> frozenset[int] | None:
-        """The numbers that are equal at the border of a node, but for factors and zero; None of other nodes."""
+        """The nodes that are equal at the border of comparison i, or the one that is zero; None if i is none."""
         nodes = self.line.nodes
         op, operands, _ = nodes[i]
         if op not in (*_SIGNS, "eq", "ne"):
@@ -97,7 +97,7 @@ class Deciding(NamedTuple):
         return frozenset(self.base(x) for x in operands if nodes[x][0] != "constant" or nodes[x][2] != 0)
 
     def base(self, i: int) -> int:
-        """The node that this one is a multiple of."""
+        """The node of which node i is a constant multiple, perhaps itself."""
         op, operands, _ = self.line.nodes[i]
         others = [x for x in operands if op == "neg" or self.line.nodes[x][0] != "constant"]
         return self.base(others[0]) if op in ("neg", "mul") and len(others) == 1 else i
@@ -110,5 +110,5 @@ class Deciding(NamedTuple):
 
 
 def inputs_below(line, roots: Sequence[int]) -> frozenset[int]:
-    """The inputs that some nodes of a line, or of a graph, depend on."""
+    """The positions of the inputs on which the nodes `roots` of a line or graph depend."""
     return frozenset(line.nodes[i][2] for i in find_ancestors(line.nodes, roots) if line.nodes[i][0] == "input")

@@ -1,18 +1,19 @@
-"""The decisions of a program: its piecewise operations, each by a number whose series tells when the piece changes.
+"""The decisions of a program: each piecewise operation becomes an input, its piece, that a switching number determines.
 
+    operation                           piece
     comparisons, abs, max, min, sign    the sign of a switching number u: −1, 0 or 1
     floor, ceil, round                  the whole number below a switching number x
     rem, trunc, conversion to integers  the whole number between x and zero
-    atan2(y, x)                         the sign of x, and where that is negative the sign of y: its cut
-    look-ups (`locate`)                 the piece of an increasing table that a number x is on
-    u / |u| of velocities               whether the vector u moves, 1, or rests, −1: dry friction in the plane
+    atan2(y, x)                         the sign of x, and where that is negative the sign of y: its branch cut
+    look-ups (`locate`)                 the interval of an increasing table that contains x
+    u / |u| of velocities               1 if the vector u moves, −1 if it rests: dry friction in the plane
 
-A *piece* is what was decided: one of these numbers, constant along a step. Here a program becomes one that takes its
-pieces as further inputs, so that along every step it is smooth; the switching numbers are outputs as well.
+With its pieces as inputs a program is smooth along every step; the series of the switching numbers, which are outputs
+as well, tell when a piece changes.
 
-Not followed are `eq` and `ne`, whose border is a point, and what does not change along the motion. Where a root or a
-power that is not whole begins right at a border, as in max(q, 0)**1.5, there is no series to begin with beyond it: such
-a border is no piece but a feature, and a step that is to pass it begins next to it.
+`eq` and `ne`, whose border is a point, and what is constant along the motion are not decisions. Where a root or a
+non-whole power is zero at a border, as in max(q, 0)**1.5, no series starts from there: such a border is not a piece but
+a *feature*, and a step that is to pass it begins next to it.
 """
 
 import math
@@ -34,14 +35,14 @@ from lagjax._program._series import LinearSystem, Recurrent, StraightLine
 from lagjax._program._simplify import is_nonnegative
 
 LARGEST_REWRITING = 10  # operations that one may become: a bound for errors, three are usual
-_BENT = 1e-9  # of a ratio that is the same at all states: a million roundings
+_RATIO_TOLERANCE = 1e-9  # of a ratio that is the same at all states: a million roundings
 
 
 class DecidedProgram(NamedTuple):
-    """A program of q (n,), q̇, t and parameters that takes its pieces as further inputs, from number `first` on.
+    """A program of q (n,), q̇, t and parameters with its pieces as further inputs, from position `first` on.
 
-    `pieces` are the nodes of these inputs, and something jumps with those in `jumping`. Of a cone, by its piece,
-    `parts` has the parts of its vector. `features` stand by their arguments, alike ones side by side.
+    `pieces` are the nodes of these inputs; an output jumps with those in `jumping`. `parts` maps the piece of a cone to
+    the nodes of its vector. `features` are pairs (argument, feature), sorted by feature.
     """
 
     line: StraightLine
@@ -60,9 +61,9 @@ class DecidedProgram(NamedTuple):
 
 
 class _SwitchingNumbers:
-    """The pieces of a graph whose first inputs `moves` tells; pieces are its inputs from the `first` one on.
+    """The decisions of a graph; `moves(x)` tells which nodes vary, and pieces are inputs from position `first` on.
 
-    What the piece `apart` jumps with is written down once for each side of it, where that piece is the number `side`.
+    If piece `apart` is set, the program is written twice, once for each value `side` of that piece.
     """
 
     def __init__(self, graph: Graph, moves: Moving, first: int, apart: int | None):
@@ -75,7 +76,7 @@ class _SwitchingNumbers:
         self._signs: dict[frozenset[int], dict[int, np.ndarray]] = {}  # the values of switching numbers of signs
 
     def piece(self, kind: int, x: int, table=None) -> int | None:
-        """The piece that a number is on; None where the number stays as it is along the motion."""
+        """The node of the piece of number x, for a decision of this kind; None if x is constant along the motion."""
         if not self.moves(x):
             return None
         decision = Decision(kind, x, table)
@@ -87,17 +88,17 @@ class _SwitchingNumbers:
         return self.pieces[j] if j != self.apart or self.side is None else self.graph.number(self.side)
 
     def known(self, x: int) -> int | None:
-        """The piece of the sign of a number, if there is one."""
+        """The piece of the sign of x if that decision exists already, else None."""
         return self.piece(SIGN, x) if Decision(SIGN, x) in self._known else None
 
     def jump(self, sign: int) -> None:
-        """Note that something jumps with a sign."""
+        """Record that the program jumps where this sign changes."""
         self.jumping.add(self.graph.term(sign)[1])
 
     def sign(self, u: int) -> int | None:
-        """The sign of a number, by the piece of what it is a multiple of.
+        """The sign of u as ± the piece of the number of which u is a multiple; None if u is constant in time.
 
-        That of |x| is 1 but at the border of x, where it is 0: the square of the piece of x, and no border of its own.
+        The sign of |x| is the square of the piece of x, 0 at its border and else 1, and no decision of its own.
         """
         if (magnitude := self.magnitude(u)) is not None:
             coefficient, _, piece = magnitude
@@ -108,7 +109,7 @@ class _SwitchingNumbers:
         return piece if piece is None or coefficient > 0 else self.graph.apply("neg", piece)
 
     def magnitude(self, x: int) -> tuple[float, int, int] | None:
-        """c, y and the piece of the sign of y, where x is c |y|, the product of y and this piece; None elsewhere."""
+        """If x is c |y|, written as y times its sign: c, y and the piece of y; else None."""
         b, size = self.graph.term(x)
         op, operands, _ = self.graph.nodes[size]
         for piece, y in (operands, operands[::-1]) if op == "mul" else ():
@@ -118,9 +119,9 @@ class _SwitchingNumbers:
         return None
 
     def _find_multiple(self, x: int) -> int | None:
-        """The sign of a number that is a multiple of a switching number by what does not move, by the piece of that.
+        """The sign of x by an existing piece, if x is a constant multiple of that switching number; else None.
 
-        Two pieces with one border would each push onto it, or not, as if the other one stayed as it is.
+        Two pieces with the same border would each slide along it, or not, as if the second one did not change.
         """
         graph, f, below = self.graph, self.graph.apply, self.graph.find_ancestors([x])
         inputs, first = inputs_below(graph, [x]), self.moves.count
@@ -135,11 +136,11 @@ class _SwitchingNumbers:
         values = eliminate_dead_code(graph, [x]).evaluate(given).reshape(2, 4)
         others = self._signs.setdefault(frozenset(i for i in inputs if i < first), {})
         for y, ratio in ((y, values / of) for y, of in others.items()):
-            if not np.ptp(ratio, axis=1).max() <= _BENT * np.abs(ratio).min():
+            if not np.ptp(ratio, axis=1).max() <= _RATIO_TOLERANCE * np.abs(ratio).min():
                 continue
             nodes = list(range(len(graph.nodes)))
             product = f("mul", *(gradient_in(graph, graph, nodes, z, [min(inputs)])[0] for z in (x, y)))
-            if self.moves(product) and np.ptp(ratio) > _BENT * np.abs(ratio).max():
+            if self.moves(product) and np.ptp(ratio) > _RATIO_TOLERANCE * np.abs(ratio).max():
                 continue
             sign = graph.number(math.copysign(1.0, ratio[0, 0])) if self.moves(product) else f("sign", product)
             known = self.known(y)
@@ -150,7 +151,7 @@ class _SwitchingNumbers:
 
 
 class _PieceRewriter:
-    """The walk through a program, node by node: `places` says what each becomes in the graph with pieces."""
+    """The rewriting of a program, node by node: `places` has the id of each node in the graph with pieces."""
 
     def __init__(self, program: Recurrent, size: int, deciding: Deciding, apart: int | None):
         self.program, self.line, self.deciding = program, program.line, deciding
@@ -164,15 +165,15 @@ class _PieceRewriter:
         compared = {deciding.compared(i) for i in deciding.decisive if self.line.nodes[i][0] not in ("eq", "ne")}
         self.borders_of_decisions = compared - {None}
 
-    def place_nodes(self) -> None:
+    def rewrite_nodes(self) -> None:
         every = range(len(self.line.nodes))
         if self.switches.apart is None:
-            self._place_each(every)
+            self._rewrite_each(every)
             return
         relevant, sides = self.deciding.decisive | self.deciding.abrupt, []
         for side in (-1.0, 1.0):
             self.places, self.switches.side = [], side
-            self._place_each(every)
+            self._rewrite_each(every)
             sides.append(self.places)
         self.places, self.switches.side = [], None
         piece = self.switches.pieces[self.switches.apart]
@@ -180,11 +181,11 @@ class _PieceRewriter:
         is_above = self.graph.apply("gt", piece, self.graph.number(0.0))
         for i, (below, above) in enumerate(zip(*sides, strict=True)):
             if i not in relevant:
-                self._place_each([i])
+                self._rewrite_each([i])
             else:
                 self.places.append(below if below == above else self.graph.apply("select", is_above, below, above))
 
-    def _place_each(self, nodes: Sequence[int]) -> None:
+    def _rewrite_each(self, nodes: Sequence[int]) -> None:
         graph, deciding = self.graph, self.deciding
         for i in nodes:
             (op, operands, attribute), kind = self.line.nodes[i], self.line.kinds[i]
@@ -198,19 +199,19 @@ class _PieceRewriter:
             if decided is None and op == "div":
                 decided = self._decide_direction(*of)
             if decided is None and i in deciding.abrupt and deciding.decides(i):
-                self._note_border(op, of)
+                self._record_border(op, of)
             self.places.append(graph.node(op, *of, attribute=attribute) if decided is None else decided)
 
-    def _note_border(self, op: str, of: list[int]) -> None:
+    def _record_border(self, op: str, of: list[int]) -> None:
         if op in (*COMPARISONS, "max", "min", "abs", "sign"):
             u = of[0] if op in ("abs", "sign") else self.graph.apply("sub", *of)
-            self.features.note(self.graph.term(u)[1], UP_TO, 1.0)
+            self.features.record(self.graph.term(u)[1], UP_TO, 1.0)
 
     def _result_by_piece(self, i: int, op: str, of: list[int], attribute) -> int | None:
-        """The result of a node by its piece; None where it has none."""
+        """The node of a decisive operation by its piece; None if it has none."""
         if i in self.deciding.cones:
             return self._decide_cone(i, op, of)
-        self.features.note_operation(op, of)
+        self.features.record_operation(op, of)
         if not self.deciding.decides(i) or (op == "atan2" and is_nonnegative(self.line, self.line.nodes[i][1][1])):
             return None
         if op in (*COMPARISONS, "max", "min", "abs", "sign"):
@@ -246,9 +247,9 @@ class _PieceRewriter:
         return f("neg", whole) if op == "ceil" else f("convert", whole, attribute=attribute)
 
     def _decide_angle(self, y: int, x: int) -> int | None:
-        """atan2(y, x) by the side of its cut, y = 0 where x < 0; None where no motion crosses that.
+        """The node of atan2(y, x) by the side of its branch cut (y = 0, x < 0); None if no motion crosses that.
 
-        Only where x < 0 is y the switching number, so that an angle of zero is no border; at x = 0 nothing jumps.
+        y is the switching number only where x < 0, so that an angle of zero is no border; nothing jumps at x = 0.
         """
         f, number, sign = self.graph.apply, self.graph.number, self.switches.sign
         half = sign(x)
@@ -266,9 +267,9 @@ class _PieceRewriter:
         return f("add", angle, f("select", beside, number(0.0), back))
 
     def _known_sign(self, i: int, a: int, b: int) -> int | None:
-        """The piece that decides whether two numbers are equal, which is node i of the program.
+        """The node whose being zero means a == b, where existing pieces decide that; i is the comparison. Else None.
 
-        Of x and max(x, y), say, which are equal where x is larger: 0 there, and else 1.
+        For x == max(x, y), which is true where x is larger: 0 there, and else 1.
         """
         f, zero = self.graph.apply, self.graph.number(0.0)
         for x, z in ((a, b), (b, a)):
@@ -287,7 +288,7 @@ class _PieceRewriter:
     # ---- quotients ----
 
     def _decide_cone(self, i: int, op: str, of: list[int]) -> int:
-        """A root of a sum of squares, or what is decided about it: 1 at rest, where the sum is zero."""
+        """The node of a root of a sum of squares (1 at rest), or of a comparison of it, by the piece of the cone."""
         graph, f, square = self.graph, self.graph.apply, self.places[self.deciding.cones[i]]
         one, tiny = graph.number(1.0), graph.number(NOTHING**2)
         piece = self.switches.piece(CONE, f("sqrt", f("add", square, tiny)))
@@ -305,9 +306,9 @@ class _PieceRewriter:
         return moves if says_moving else f("not", moves)
 
     def _decide_direction(self, x: int, size: int) -> int | None:
-        """x / |x| as the piece of x, which has both sides at x = 0, too; None of other quotients.
+        """The node of x / |x| as the piece of x, which is defined at x = 0; None for other quotients.
 
-        The size may be replaced by a number where it is zero, by `where`.
+        A `where` may replace the size by a number where it is zero.
         """
         op, operands, _ = self.graph.nodes[size]
         if op != "select":
@@ -319,7 +320,7 @@ class _PieceRewriter:
         return self.graph.apply("select", operands[0], *branches)
 
     def _sign_of_quotient(self, x: int, size: int) -> int | None:
-        """x / size, where the size is a multiple of |x|: a multiple of the piece of x."""
+        """The node of x / size as a multiple of the piece of x, if the size is a multiple of |x|; else None."""
         (a, x), magnitude = self.graph.term(x), self.switches.magnitude(size)
         if magnitude is None or magnitude[1] != x:
             return None
@@ -347,9 +348,9 @@ class _PieceRewriter:
 def find_decisions(
     program: Recurrent, size: int, slides: bool, watched: int, beside: bool, apart: int | None = None
 ) -> DecidedProgram | None:
-    """The program with pieces; None where it has neither these nor features. The arguments are those of `Deciding`.
+    """The program with its pieces as inputs; None if it has neither decisions nor features. Arguments as in `Deciding`.
 
-    What the piece `apart` jumps with is there for both of its sides, each with pieces of its own.
+    If `apart` is set, nodes that jump with this piece are written for both of its sides, each with pieces of its own.
     """
     deciding = Deciding.from_program(program, size, slides, watched, beside)
     relevant, nodes = deciding.decisive | deciding.abrupt, program.line.nodes
@@ -359,8 +360,8 @@ def find_decisions(
     ):
         return None
     rewriting = _PieceRewriter(program, size, deciding, apart)
-    rewriting.place_nodes()
+    rewriting.rewrite_nodes()
     for base, exponent in powers:
-        rewriting.features.note_power(rewriting.places[base], exponent)
+        rewriting.features.record_power(rewriting.places[base], exponent)
     found = rewriting.finish(size)
     return found if found.decisions or found.features else None

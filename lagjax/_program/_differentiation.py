@@ -1,17 +1,17 @@
-"""Derivatives of scalar programs: in forward and in reverse mode, of the nodes of a graph and of straight lines.
+"""Derivatives of scalar programs, in forward and in reverse mode: of nodes of a graph, and of straight lines.
 
-A derivative of scalars is more scalars of the same graph. What it costs is then what it consists of: only operations
-that carry a derivative are looked at, where an array derivative goes through every zero of its unit vectors. The rules
-are those of `_operations`: a scalar operation is its own transpose, so that one formula, linear in g, takes a cotangent
-from the result to an operand and a tangent from an operand to the result.
+The derivative of a scalar program is built from scalars of the same graph, and only operations that carry a derivative
+are visited; an array derivative would visit every zero of its unit vectors. The rules are those of `_operations`: a
+scalar operation is its own transpose, so that one formula, linear in g, maps a cotangent of the result to one of an
+operand and a tangent of an operand to one of the result.
 
-    Derivatives        of nodes of a graph: gradients of a function that was taped, tangents along directions
+    Derivatives        of nodes of a graph: gradients of a recorded function, tangents along directions
     pushforward        of a straight line along one direction, as a straight line
     with_tangents      a straight line and its tangents along several directions, in one
     pullback           the transpose of `pushforward`, as a straight line
-    gradient_in        the gradient of a node of a straight line, in the graph in which the line is
+    gradient_in        the gradient of a node of a straight line, in the graph into which the line was copied
 
-These are derivatives of the operations as they stand: `has_own_rules` in `_rules` finds functions with other ones.
+Custom derivative rules of the user are not applied: `has_own_rules` in `_rules` finds functions that have some.
 """
 
 import functools
@@ -40,10 +40,10 @@ def copy_nodes(
     inputs: Sequence[int] | Callable[[int, list[int]], int | None] = lambda i, nodes: None,
     places: Sequence | None = None,
 ) -> list[int]:
-    """The nodes of a line, of a tape or of another graph in a graph, where `inputs` are its inputs.
+    """Copy the nodes of a line, tape or graph into `graph`; return their ids there. `inputs[i]` replaces input i.
 
-    These may follow from the nodes before, `inputs(i, nodes)`, or stay as they are, None. Tables move where `places`
-    says what input i becomes.
+    As a function, `inputs(i, nodes)` may use the nodes copied so far, or keep the input (None). Tables are shifted
+    where `places[i]` gives the new position of input i.
     """
     nodes: list[int] = []
     for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):
@@ -65,9 +65,9 @@ def copy_operation(graph: Graph, op: str, operands: Sequence[int], attribute: An
 
 
 def replace_nodes(graph: Graph, among: Iterable[int], sides: Sequence[dict[int, int]]) -> None:
-    """Add to each of the `sides`, where some nodes become others, what those `among` the nodes behind them become.
+    """Propagate replacements: each dict in `sides` maps nodes to new ones; add what the later nodes in `among` become.
 
-    What becomes the same on both of two sides stays as it is.
+    With two dicts, a node that becomes the same in both is left as it is.
     """
     for i in among:
         op, operands, attribute = graph.nodes[i]
@@ -82,10 +82,10 @@ def replace_nodes(graph: Graph, among: Iterable[int], sides: Sequence[dict[int, 
 
 
 class Derivatives:
-    """Derivatives of nodes of a graph; `operations` counts what they consist of before anything is simplified.
+    """Differentiation of nodes of a graph; `operations` counts the operations before simplification.
 
-    What has overflown `hides` its derivatives, but for those of a line of tangents, which are linear in these. A line
-    `asks` whether a tangent is zero, but one that JAX is to transpose.
+    `hides`: derivatives are set to zero where the value has overflown and is constant (not for lines that are linear in
+    tangents). `asks`: the result may test whether a tangent is zero (not for a line that JAX will transpose).
     """
 
     def __init__(self, graph: Graph):
@@ -97,11 +97,10 @@ class Derivatives:
     def gradient(
         self, tape: Tape, nodes: list[int], output: int, by: Sequence[int], together: bool, again: Sequence[int] = ()
     ) -> list[int]:
-        """The nodes of the derivatives of scalar `output` of a tape by its inputs at positions `by`, in that order.
+        """The derivative nodes of scalar `output` of a tape by its inputs at positions `by`, in that order.
 
-        `nodes[k]` is scalar k of the tape in the graph. With `together` the cotangents of equal scalars are added at
-        once, else each is followed on its own as long as it is written apart. `again` are the inputs by which the
-        result will be differentiated once more.
+        `nodes[k]` is scalar k of the tape in the graph. With `together`, cotangents of equal scalars are added at once;
+        else each is propagated separately. `again` are the inputs by which the result will be differentiated once more.
         """
         first: dict[tuple, int] = {}
         taken = [tape.branches.get(k) for k in range(len(nodes))]
@@ -125,7 +124,7 @@ class Derivatives:
         return [results.get(i, self._number(0.0)) for i in by]
 
     def slopes(self, output: int, through: Iterable[int], by: Sequence[int]) -> list[int]:
-        """The derivatives of a node by others as if they were independent, `through` the nodes between, in order."""
+        """The derivatives of node `output` by the nodes `by`, taken as independent; `through` are the nodes between."""
         cotangents, ends = {output: self._number(1.0)}, set(by)
         for i in reversed(list(through)):
             if i in ends or (g := cotangents.pop(i, None)) is None:
@@ -137,7 +136,7 @@ class Derivatives:
         return [cotangents.get(i, self._number(0.0)) for i in by]
 
     def _find_varying(self, tape: Tape, nodes: list[int], by: Sequence[int]) -> list[bool]:
-        """True for every scalar of a tape that depends on the inputs `by` and has a derivative."""
+        """For every scalar of a tape: True if it depends on the inputs `by` and has a derivative."""
         varied, inputs = [], frozenset(by)
         for k, (op, operands, attribute) in enumerate(tape.nodes):
             depends = attribute in inputs if op == "input" else any(varied[x] for x in operands)
@@ -147,7 +146,7 @@ class Derivatives:
     # ---- forward mode ----
 
     def directional_derivatives(self, outputs: Sequence[int], directions: Sequence[Tangents]) -> list[Tangents]:
-        """The tangents of the nodes `outputs` along each of `directions`, which maps inputs to their tangents."""
+        """The tangents of the nodes `outputs`, each {direction: tangent}; a direction maps nodes to their tangents."""
         tangents: dict[int, Tangents] = {}
         for k, direction in enumerate(directions):
             for i, tangent in direction.items():
@@ -173,7 +172,7 @@ class Derivatives:
         return {k: tangent for k, tangent in result.items() if self.graph.value(tangent) != 0}
 
     def quotient_tangent(self, w: int, v: int, of_u: int | None, of_v: int | None) -> int:
-        """(u′ − w v′)/v, the tangent of w = u / v: one division, where the two rules have two."""
+        """The tangent (u′ − w v′)/v of w = u / v, with one division instead of two."""
         if of_v is None:
             assert of_u is not None
             return self._apply_operation("div", of_u, v)
@@ -184,7 +183,7 @@ class Derivatives:
     # ---- rules ----
 
     def rules(self, w: int, op: str, operands: Sequence[int]) -> list[_Rule | None]:
-        """The rules that take a cotangent, or a tangent, of each operand past w = op(operands); None: there is none."""
+        """For each operand the map from a cotangent of w = op(operands) to its own; it also maps its tangent to w's."""
 
         def apply_rule(rule, g):
             result = rule(self._apply_operation, self._number, g, w, *operands)
@@ -207,14 +206,14 @@ class Derivatives:
         return [rule and functools.partial(apply_rule, rule) for rule in rules]
 
     def _extreme_share(self, op: str, u: int, v: int, g: int) -> int:
-        """The cotangent of the operand u of an extreme of several numbers: those that are equal have equal shares."""
+        """The cotangent of operand u of a nested max or min: operands equal to the extreme get equal shares of g."""
         f, counts = self._apply_operation, [self._count_equal(op, x) for x in (u, v)]
         shared = f("div", counts[0], f("add", *counts))
         whole = f("select", f("gt" if op == "max" else "lt", u, v), self._number(0.0), self._number(1.0))
         return f("mul", g, f("select", f("eq", u, v), whole, shared))
 
     def _count_equal(self, op: str, i: int) -> int:
-        """The count of the numbers that a node is the extreme of, and that are equal to it."""
+        """The node of the count of operands of nested max or min i that equal the extreme."""
         if self.graph.nodes[i][0] != op:
             return self._number(1.0)
         f, (u, v) = self._apply_operation, self.graph.nodes[i][1]
@@ -223,35 +222,35 @@ class Derivatives:
         return f("select", f("eq", u, v), one, f("add", of_u, of_v))
 
     def _mask_quotient(self, tangent: int, w: int, v: int) -> int:
-        """A tangent, or a cotangent, of w = u/v: 0 where w is flat, as what has overflown gives no number."""
+        """A tangent or cotangent of w = u/v, set to 0 where v has overflown and w is constant, instead of NaN."""
         return self._mask_nan(tangent, lambda: self.graph.is_flat_quotient(w, v)) if self.graph.grows(v) else tangent
 
     def _mask_product(self, product: int, g: int, slope: int) -> int:
-        """A product of g and a slope, 0 where g is and the slope is huge."""
+        """The product of g and a slope, set to 0 where g is 0 and the slope is huge, instead of NaN."""
         if not (self.asks and self.hides and self.graph.hides_growth and self.graph.grows(slope)):
             return product
         is_zero = self._apply_operation("eq", g, self._number(0.0))
         return self._mask_nan(product, lambda: self._apply_operation("and", is_zero, self.graph.is_huge(slope)))
 
     def _mask_nan(self, x: int, where: Callable[[], int]) -> int:
-        """0 in the place of what is no number; what is finite stays, and has derivatives of its own."""
+        """x, with 0 in place of infinity or NaN where the flag `where()` holds; derivatives of finite x are kept."""
         f, zero = self._apply_operation, self._number(0.0)
         return f("select", f("is_finite", x), f("select", where(), x, zero), x)
 
     def _refuse_overflow(self, result: int, g: int, w: int) -> int:
-        """NaN where w is infinite and matters: its operand has overflown, whose logarithm or root has a slope."""
+        """NaN where w is infinite and g is not zero: the operand has overflown, but w has a slope in truth."""
         f = self._apply_operation
         known = f("or", f("is_finite", w), f("eq", g, self._number(0.0)))
         return f("select", known, self._number(math.nan), result)
 
     def _rules(self, w: int, op: str, operands: Sequence[int], attribute: Any = None) -> Sequence[_Rule | None]:
-        """`rules`, where a power is one operation."""
+        """As `rules`, and for `integer_pow` the power rule."""
         if op == "integer_pow":
             return [lambda g: self._power_derivative(operands[0], attribute, g)]
         return self.rules(w, op, operands)
 
     def _single_use_rules(self, w: int, op: str, operands: Sequence[int], attribute: Any) -> Sequence[_Rule | None]:
-        """`_rules` for the only cotangent of w: factors 2 and ½ are next to others, with which they cancel."""
+        """As `_rules`, for the only cotangent of w: factors 2 and ½ are placed where they cancel with others."""
         if op == "sqrt" and not self.graph.grows(w):
             return [lambda g: self._apply_operation("mul", self._number(0.5), self._apply_operation("div", g, w))]
         if op == "mul" and operands[0] == operands[1]:
@@ -259,7 +258,7 @@ class Derivatives:
         return self._rules(w, op, operands, attribute)
 
     def _power_derivative(self, base: int, exponent: float, g: int) -> int:
-        """p uᵖ⁻¹ g, which is finite at u = 0 where the products and roots that make up uᵖ have no derivative."""
+        """The cotangent p uᵖ⁻¹ g of the base of uᵖ: finite at u = 0, unlike that of the products and roots in uᵖ."""
         lower = base if exponent == 2 else self._apply_operation("pow", base, self._number(exponent - 1))
         slope = self._apply_operation("mul", self._number(exponent), lower)
         return self._mask_product(self._apply_operation("mul", g, slope), g, slope)
@@ -267,7 +266,7 @@ class Derivatives:
     # ---- the graph ----
 
     def node_to_differentiate(self, i: int) -> Node:
-        """A node as it is differentiated: a power is one operation, not the products that it consists of."""
+        """Node i, or `integer_pow` of its base if it is recorded as a power, whose derivative is one operation."""
         if i in self.graph.powers:
             base, exponent = self.graph.powers[i]
             return "integer_pow", (base,), exponent
@@ -293,10 +292,10 @@ class Derivatives:
 def pushforward(
     line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Sequence[int], known=(), in_jax: bool = False
 ) -> StraightLine:
-    """The line from the inputs and the tangents of the inputs `by` to the tangents of the outputs `of`.
+    """The straight line from the inputs, then tangents of the inputs `by`, to the tangents of the outputs `of`.
 
-    `dtypes` has the type of every input of `line`. Its inputs come first, the tangents after them, and after those the
-    values of the outputs `known`, which are not computed once more. JAX may transpose it where it is one `in_jax`.
+    `dtypes` has the type of every input of `line`. After the tangents, the result takes the values of the outputs
+    `known`, which it does not compute again. `in_jax`: JAX may transpose the result, so that it must stay linear.
     """
     places = {i: len(dtypes) + k for k, i in enumerate(by)}
     placed = _PlacedLine.from_line(line, dtypes, len(by))
@@ -309,7 +308,7 @@ def pushforward(
 
 
 def pullback(line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Sequence[int], known=()) -> StraightLine:
-    """The transpose of `pushforward`: its last inputs but those `known` are the cotangents of the outputs `of`."""
+    """The transpose of `pushforward`: it takes cotangents of the outputs `of` and gives those of the inputs `by`."""
     return pullback_and_entries(line, dtypes, by, of, known)[0]
 
 
@@ -322,10 +321,10 @@ def pullback_and_entries(
     varies: Callable[[Table], bool] = lambda table: True,
     is_linear: bool = False,
 ) -> tuple[StraightLine, tuple[Table, ...]]:
-    """`pullback`, and the cotangents of the entries of tables that are not among the inputs `by`, where these `varies`.
+    """As `pullback`, and also the cotangents of entries of tables that are not inputs in `by` and for which `varies`.
 
-    For each of the tables two outputs come behind those of the inputs: the index of an entry, and its cotangent.
-    `is_linear` says that the line is one of tangents, linear in the inputs `by`.
+    For each such table two outputs follow those of the inputs: the index of an entry, and its cotangent. `is_linear`:
+    the line computes tangents, linear in the inputs `by`.
     """
     placed, tables = _PlacedLine.from_line(line, dtypes), []
     placed.hides = not is_linear
@@ -348,11 +347,11 @@ def with_tangents(
     of: Sequence,
     tables: "Sequence[TangentTable | None] | None" = None,
 ) -> StraightLine:
-    """A straight line and its tangents along some directions, in one.
+    """One straight line for a line and its tangents along several directions.
 
-    Input i of `line` is input `places[i]` of the result, its tangent along a direction d input `directions[d][i]`; an
-    input that is not there does not move. Of numbers of a member that are only looked up, `tables[d]` gives the table
-    of tangents. The outputs are `of`, pairs of an output and a direction, or None for the output itself.
+    Input i of `line` is input `places[i]` of the result, its tangent along direction d is input `directions[d][i]`; a
+    missing input has tangent zero. `tables[d]` maps a table that is only looked up to the table of its tangents. Each
+    output in `of` is a pair (output, direction), with direction None for the output itself.
     """
     graph, kinds = Graph(_LARGEST_DERIVATIVE * len(line.nodes) * (1 + len(directions)) + 1000), [*map(_kind, dtypes)]
     with np.errstate(all="ignore"):
@@ -372,21 +371,23 @@ def with_tangents(
 
 
 def gradient_in(graph: Graph, line: Any, nodes: list[int], node: int, by: Sequence[int]) -> list[int]:
-    """The derivatives of one node of a line by the inputs `by`, as nodes of the graph in which the line is `nodes`."""
+    """The derivative nodes of one `node` of a line by the inputs `by`; `nodes` are the ids of the line in the graph."""
     slopes = slopes_in(graph, line, nodes, node, by)
     return [slopes[i] if i in slopes else graph.number(0.0) for i in by]
 
 
 def slopes_in(graph: Graph, line: Any, nodes: Sequence[int], node: int, by: Container[int]) -> dict[int, int]:
-    """`gradient_in`, of a line or of a graph, by the inputs among `by` that the node depends on."""
+    """As `gradient_in`, as {input: derivative}, for those of the inputs `by` on which the node depends."""
     return _PlacedLine(graph, line, nodes).pull({node: graph.number(1.0)}, by)
 
 
 def tangents_in(
     graph: Graph, line: StraightLine, nodes: list[int], of_inputs: dict[int, int], places: dict[int, int]
 ) -> dict[int, int]:
-    """The tangents of the nodes of a line that have some, from those of its inputs, in the graph in which it is
-    `nodes`; the tangent of input i is input `places[i]`."""
+    """The tangents {node of the line: tangent} from those of its inputs, `of_inputs`, as nodes of the graph.
+
+    `nodes` are the ids of the line in the graph; the tangent of input i is input `places[i]`.
+    """
     return _PlacedLine(graph, line, nodes).tangents(of_inputs, places)
 
 
@@ -395,7 +396,7 @@ def _kind(dtype) -> str:
 
 
 class _PlacedLine(Derivatives):
-    """A straight line that is `nodes` in a graph, of which its derivatives become part."""
+    """Derivatives of a straight line whose nodes are copied into a graph as `nodes`; they are added to that graph."""
 
     def __init__(self, graph: Graph, line: Any, nodes: Sequence[int]):
         super().__init__(graph)
@@ -403,14 +404,14 @@ class _PlacedLine(Derivatives):
 
     @classmethod
     def from_line(cls, line: StraightLine, dtypes: Sequence, more: int = 0) -> "_PlacedLine":
-        """The line in a new graph, whose inputs have the types `dtypes`; `more` floats follow them."""
+        """The line in a new graph, with inputs of types `dtypes` and `more` floats after them."""
         graph = Graph(_LARGEST_DERIVATIVE * len(line.nodes) + 1000)
         inputs = [graph.input(i, kind) for i, kind in enumerate([*map(_kind, dtypes), *["float"] * more])]
         with np.errstate(all="ignore"):
             return cls(graph, line, copy_nodes(graph, line, inputs))
 
     def finish_line(self, results: list[int], known: Sequence[int], first: int) -> StraightLine:
-        """The line of some results, which reads the outputs `known` of the line as inputs from `first` on."""
+        """The straight line of the nodes `results`; it reads the outputs `known` as inputs from position `first` on."""
         results, count = results + [self.nodes[self.line.outputs[i]] for i in known], len(results)
         done = eliminate_dead_code(*sink_negations(*factor(self.graph, results)))
         values = done.outputs[count:]
@@ -421,10 +422,10 @@ class _PlacedLine(Derivatives):
     def tangents(
         self, of_inputs: dict[int, int], places: dict[int, int], beside: "TangentTable | None" = None
     ) -> dict[int, int]:
-        """The tangents of the nodes that have some, from those of the inputs.
+        """The tangents {node of the line: tangent} of all nodes that have one, from those of the inputs.
 
-        The tangent of input i is input `places[i]`. Of a table that is not among these, `beside` gives that of the
-        tangents of its entries; None: they have none.
+        The tangent of input i is input `places[i]`. `beside` maps any other table to that of the tangents of its
+        entries; None: they have none.
         """
         graph, line, nodes, tangents = self.graph, self.line, self.nodes, {}
         for k, (op, operands, attribute) in enumerate(line.nodes):
@@ -455,17 +456,15 @@ class _PlacedLine(Derivatives):
         varies: Callable[[Table], bool] = lambda table: False,
         is_linear: bool = False,
     ) -> dict[int, int]:
-        """The cotangents of some inputs, by their numbers, from those of some nodes.
+        """The cotangents {input: cotangent} of those of `inputs` that matter, from the cotangents of nodes of the line.
 
-        A root whose slope is infinite has a cotangent that is infinite, too; past a slope of zero, as that of
-        max(q, 0) on its flat side, it is zero. So is all that leaves a branch that is not taken.
-
-        Those of entries of a table that `varies` are added to `tables`: the table, the index, and the cotangent; or,
-        where the table consists of inputs `by`, to each of these.
+        At an infinite slope the cotangent is infinite; behind a zero slope, as on the flat side of max(q, 0), it is
+        zero, and so it is in a branch that is not taken. Cotangents of entries of tables for which `varies` are
+        appended to `tables` as (table, index, cotangent), or added to the inputs if the table consists of `inputs`.
         """
         line, nodes, results, above = self.line, self.nodes, {}, find_ancestors(self.line.nodes, cotangents)
         varied, flat = self._find_varying_nodes(above, inputs, varies), ("mul",) if is_linear else ("max", "min")
-        beneath = self._find_beneath_roots(above, varied, is_linear)
+        beneath = self._find_root_operands(above, varied, is_linear)
         conditions = self._find_conditions(above, cotangents)
         for k in reversed(above):
             (op, operands, attribute), g = line.nodes[k], cotangents.get(k)
@@ -497,7 +496,7 @@ class _PlacedLine(Derivatives):
     def _find_varying_nodes(
         self, among: Sequence[int], inputs: Container[int], varies: Callable[[Table], bool]
     ) -> set[int]:
-        """Those nodes that depend on some inputs, or on entries of a table that `varies`."""
+        """The float nodes in `among` that depend on `inputs`, or on entries of a table for which `varies`."""
         varied: set[int] = set()
         for k in among:
             op, operands, attribute = self.line.nodes[k]
@@ -511,9 +510,10 @@ class _PlacedLine(Derivatives):
         return varied
 
     def _find_conditions(self, among: Sequence[int], outputs: Iterable[int]) -> dict[int, frozenset]:
-        """The predicates and branches of selections that each node but inputs is read in, and nowhere else.
+        """For each node, the (predicate, branch) pairs of `select` under which alone it is read; inputs have none.
 
-        Only those with nodes that may be no number, or infinite, where nothing that is read outside of branches is.
+        A pair is kept only if the branch contains nodes that may be infinite or NaN, and none of these is read
+        elsewhere.
         """
         nodes, nothing = self.line.nodes, frozenset()
         conditions, read, wild, doubtful = dict.fromkeys(outputs, nothing), set(outputs), set(), set()
@@ -533,14 +533,14 @@ class _PlacedLine(Derivatives):
         return {k: of & doubtful for k, of in conditions.items()}
 
     def _zero_where_zero(self, k: int, g: int, part: int) -> int:
-        """The part of `g` that node k passes on: 0 of 0, also where its slope is infinite, as that of u**0.5 at 0.
+        """The cotangent `part` that node k passes on, set to 0 where g is 0, even at an infinite slope (u**0.5 at 0).
 
-        There a program has a number in the place of the slope (`_recurrences.finite`), so that g is 0. And 0 past the
-        root of a power at a base of zero.
+        A program has a finite number in place of such a slope (`_recurrences.finite`), so that g is 0 there. The root
+        of a power passes on 0 at a base of zero.
         """
         nodes, (op, operands, _) = self.line.nodes, self.line.nodes[k]
         by_root = op == "div" and (of := nodes[operands[1]][0]) not in ("input", "constant") and OPERATIONS[of].steep
-        if not (self.asks and (OPERATIONS[op].steep or by_root or (op == "div" and k in self._find_guarded))):
+        if not (self.asks and (OPERATIONS[op].steep or by_root or (op == "div" and k in self._find_guarded_nodes))):
             return part
         if k in self._roots_of_powers:
             part = self._select_unless_zero(self.nodes[operands[0]], part)
@@ -548,7 +548,7 @@ class _PlacedLine(Derivatives):
 
     @functools.cached_property
     def _roots_of_powers(self) -> set[int]:
-        """The nodes √u of which only products with u are made, which have a slope at u = 0: u √u, that of u^1.5."""
+        """The nodes √u that occur only in products with u, as in u √u = u^1.5, which has a slope at u = 0."""
         nodes, roots = self.line.nodes, {k for k, (op, *_) in enumerate(self.line.nodes) if op == "sqrt"}
         parts = {k: {(k, nodes[k][1][0])} for k in roots}  # the roots that a node is a multiple of, each with its u
         factors: list[set[int]] = []
@@ -559,13 +559,13 @@ class _PlacedLine(Derivatives):
                 for root, u in parts.get(i, ()):
                     if op == "neg" or (op == "mul" and u not in factors[k]):
                         parts.setdefault(k, set()).add((root, u))
-                    elif op != "mul" and k not in self._find_guarded:
+                    elif op != "mul" and k not in self._find_guarded_nodes:
                         roots.discard(root)
         return roots
 
     @functools.cached_property
-    def _find_guarded(self) -> set[int]:
-        """The nodes of products and quotients that the line asks whether they are finite."""
+    def _find_guarded_nodes(self) -> set[int]:
+        """The products and quotients whose value, or a multiple of it, is tested by `is_finite` in the line."""
         guarded: set[int] = set()
         for k in range(len(self.nodes) - 1, -1, -1):
             op, operands, _ = self.line.nodes[k]
@@ -574,14 +574,14 @@ class _PlacedLine(Derivatives):
         return guarded
 
     def _select_unless_zero(self, number: int, part: int) -> int:
-        """The part, but 0 in the place of NaN where the number is zero; where the part is finite it has derivatives."""
+        """The node of `part`, with 0 in place of NaN where `number` is zero; derivatives of finite parts are kept."""
         f, zero = self.graph.apply, self._number(0.0)
         return f("select", f("eq", number, zero), part, f("select", f("is_finite", part), zero, part))
 
-    def _find_beneath_roots(self, among: Sequence[int], varied: set[int], is_linear: bool) -> set[int]:
-        """The nodes that vary and that operations of steep slopes depend on; in a line of tangents, their tangents.
+    def _find_root_operands(self, among: Sequence[int], varied: set[int], is_linear: bool) -> set[int]:
+        """The varying nodes on which an operation with an infinite slope depends.
 
-        There a tangent beneath a root is one that is asked whether it is zero (`_zero_where_zero`).
+        In a line of tangents, which is linear, they are found by the tests for zero that `_zero_where_zero` wrote.
         """
         nodes, beneath = self.line.nodes, set()
         for k in reversed(among):
@@ -594,7 +594,7 @@ class _PlacedLine(Derivatives):
 
 
 def _tangents_of(table: Table, places: dict[int, int], beside: "TangentTable | None") -> Table | None:
-    """The table of the tangents of the entries of another one; None where they have none."""
+    """The table with the tangents of the entries of `table`; None if they have none."""
     if table.numbers is not None:
         return None
     if table.first not in places:

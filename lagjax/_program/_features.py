@@ -1,7 +1,7 @@
-"""Narrow features: functions that are flat to rounding until their argument comes near.
+"""Narrow features: functions that are constant to rounding until their argument comes near a value.
 
-There they change within a unit of it, as exp(u) does beyond u = −80, and powers with a base that falls, or rises, by
-much (`_powers`). No series of the motion shows one from afar, but its argument has one.
+Near it they change within one unit of the argument: exp(u) beyond u = −80, or a power whose base changes by orders of
+magnitude (`_powers`). The series of the motion does not show a feature in advance, but that of its argument does.
 """
 
 import math
@@ -24,14 +24,14 @@ WITH_FEATURES = frozenset((*_FUNCTIONS, "pow"))
 
 
 class Feature(NamedTuple):
-    """A narrow feature: what it is flat like, and in which units of its argument, or to which power of it."""
+    """A narrow feature: the kind of function, and the scale of its argument or the exponent of a power."""
 
     kind: int
     scale: float
 
 
 class Moving:
-    """A test which nodes of a graph change along a motion, not only in steps; its first inputs, `count` of them, do."""
+    """A callable: True for nodes that vary continuously along a motion; the first `count` inputs of the graph do."""
 
     def __init__(self, graph: Graph, count: int):
         self.graph, self.count = graph, count
@@ -46,58 +46,58 @@ class Moving:
 
 
 class Features:
-    """The features of a program, `found` by their argument, a node of a graph, and their kind."""
+    """The narrow features of a program: `found` maps (argument node, kind) to a feature."""
 
     def __init__(self, graph: Graph, moves: Moving):
         self.graph, self.moves = graph, moves
         self.found: dict[tuple[int, int], Feature] = {}
 
-    def note(self, u: int, kind: int, scale: float) -> None:
-        """A function of u, as a feature if u moves."""
+    def record(self, u: int, kind: int, scale: float) -> None:
+        """Record a feature with argument u, if u varies; of two of one kind the larger scale is kept."""
         if self.moves(u):
             known = self.found.get((u, kind), Feature(kind, scale))
             self.found[u, kind] = Feature(kind, max(scale, known.scale))
 
-    def note_operation(self, op: str, operands: list[int]) -> None:
-        """A function that is flat, or a power with an exponent that is no constant."""
+    def record_operation(self, op: str, operands: list[int]) -> None:
+        """Record the feature of a function that is flat, or of a power with a variable exponent."""
         f, u = self.graph.apply, operands[0]
         if op in ("erf", "erfc"):  # whose slope is exp(−u²)
             u = f("neg", f("mul", u, u))
         if op in _FUNCTIONS:
-            self.note(u, *_FUNCTIONS[op])
+            self.record(u, *_FUNCTIONS[op])
         elif op == "pow" and self.graph.value(operands[1]) is None:
-            self._note_exponent(*operands)
+            self._record_exponent(*operands)
 
-    def note_power(self, base: int, exponent: float) -> None:
-        """A power of a number: one that is to be large by its square, and sums of exponentials by their arguments."""
+    def record_power(self, base: int, exponent: float) -> None:
+        """Record the feature of a power: a positive one by its squared base, one of exponentials by arguments."""
         op, operands, _ = self.graph.nodes[base]
         if op in ("exp", "exp2"):
-            self.note(self.graph.scale(exponent, operands[0]), *_FUNCTIONS[op])
+            self.record(self.graph.scale(exponent, operands[0]), *_FUNCTIONS[op])
         elif exponent > 0:
-            self.note(self.graph.apply("mul", base, base), GROWS, exponent / 2)
+            self.record(self.graph.apply("mul", base, base), GROWS, exponent / 2)
         elif arguments := self._moving_exponents(base):
             for u in arguments:
-                self.note(u, BESIDE, -exponent)
+                self.record(u, BESIDE, -exponent)
         else:
-            self.note(base, FALLS, -exponent)
+            self.record(base, FALLS, -exponent)
 
     def _moving_exponents(self, i: int) -> list[int]:
-        """The arguments of the exponentials that a sum consists of, but for what does not move; none of others."""
+        """The arguments of the exponentials that sum i consists of, up to constant terms; empty for other nodes."""
         op, operands, _ = self.graph.nodes[self.graph.term(i)[1]]
         if op in ("add", "sub"):
             found = [self._moving_exponents(x) for x in operands if self.moves(x)]
             return [u for some in found for u in some] if all(found) else []
         return [operands[0]] if op in GROWING else []
 
-    def _note_exponent(self, a: int, b: int) -> None:
-        """aᵇ = exp(b log |a|), where b is no constant."""
+    def _record_exponent(self, a: int, b: int) -> None:
+        """Record the feature of aᵇ = exp(b log |a|), where b is not a constant."""
         f, one = self.graph.apply, self.graph.number(1.0)
         base = f("mul", a, a) if self.moves(a) else a
         if not self.moves(b):  # then it is told as a constant would be: there is no log at a = 0
             bounds = (0.0, LEAST_POWER, LARGEST_WHOLE)
             falls, is_seen, grows = (f("lt", b, self.graph.number(bound)) for bound in bounds)
             large = f("and", grows, f("not", is_seen))
-            self.note(f("select", large, one, base), GROWS, LARGEST_WHOLE / 2)
+            self.record(f("select", large, one, base), GROWS, LARGEST_WHOLE / 2)
             base = f("select", f("or", falls, f("not", grows)), one, base)
         log = self.graph.scale(0.5, f("log", base)) if self.moves(a) else f("log", base)
-        self.note(f("mul", log, b), BELOW, 1.0)
+        self.record(f("mul", log, b), BELOW, 1.0)

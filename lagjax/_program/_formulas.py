@@ -1,15 +1,15 @@
 """The outputs of a straight line as formulas to read: sums of products, in which like terms are collected.
 
-A line is written for a processor: products are shared, signs and halves stand where they cost least. Here every sum is
-kept as it is written, and multiplied out, which shows the terms that cancel; what is multiplied out is put together
-again by the sums that the user wrote, and by parameters with the same factors. The shorter form of both is taken:
+A straight line is written for a processor: products are shared, signs and factors ½ are placed where they cost least.
+Here every sum is kept as written and also expanded, which shows terms that cancel; the expanded form is factored by the
+sums that the user wrote, and by parameters with the same cofactor. The shorter of both forms is taken:
 
     m2 l1 l2 (θ̇1 θ̇2 s − θ̇1 (θ̇1 − θ̇2) s)    ──►    m2 l1 l2 θ̇2² s
     m1 l1² + m2 l1²                            ──►    (m1 + m2) l1²
 
-A `Sum` has a coefficient for every product; a product has a power for every atom; an atom is an input of the line, a
-function of sums, or a sum that is a factor. Products of sines and cosines are put together by
-cos a cos b ± sin a sin b = cos(a ∓ b) and sin a cos b ± cos a sin b = sin(a ± b).
+A `Sum` maps products to coefficients; a product maps atoms to powers; an *atom* is an input of the line, a function of
+sums, or a sum used as a factor. Products of sines and cosines are joined by cos a cos b ± sin a sin b = cos(a ∓ b) and
+sin a cos b ± cos a sin b = sin(a ± b).
 """
 
 import functools
@@ -41,9 +41,9 @@ class Atom(NamedTuple):
 
 
 class Formulas:
-    """The sums of the outputs of a line, `outputs`, and the `atoms` that they are made of, by their ids.
+    """The `outputs` of a line as sums, and the `atoms` that they refer to by index.
 
-    The first `moving` inputs are no parameters.
+    The first `moving` inputs of the line are coordinates, velocities and time; the rest are parameters.
     """
 
     def __init__(self, line: StraightLine, moving: int):
@@ -56,7 +56,7 @@ class Formulas:
         for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):
             values.append(self._apply_operation(op, [values[i] for i in operands], attribute, kind))
             if op in ("add", "sub") and 1 < len(values[-1]) <= LONGEST_WRITTEN:
-                self._note_sum(values[-1])
+                self._record_sum(values[-1])
         self.outputs = [self._shortest_form(values[i]) for i in line.outputs]
 
     def _atom_id(self, *of) -> int:
@@ -66,11 +66,11 @@ class Formulas:
             self.atoms.append(atom)
         return self._ids[atom]
 
-    def _note_sum(self, x: Sum) -> None:
-        """Keep a sum in mind, without the factors that its terms share, if what is left has one factor in each."""
+    def _record_sum(self, x: Sum) -> None:
+        """Record a sum that the user wrote, for later factoring, if its terms without common factors are atoms."""
         shared = functools.reduce(lambda a, b: a & b, (set(product) for product in x))
         unit = {tuple(of for of in product if of not in shared): c for product, c in x.items()}
-        if any(len(product) > 1 or any(self._opens(*of) for of in product) for product in unit):
+        if any(len(product) > 1 or any(self._expands(*of) for of in product) for product in unit):
             return
         ((product, _),) = self._atom_of_sum(unit, 1).items()
         if len(product) == 1 and self.atoms[product[0][0]].kind == "sum":
@@ -82,7 +82,7 @@ class Formulas:
         if op == "constant":
             return {ONE: attribute} if attribute else {}
         if op == "input":
-            return raised(self._atom_id("input", attribute))
+            return atom_power(self._atom_id("input", attribute))
         if op in ("add", "sub"):
             return add(xs[0], xs[1], 1.0 if op == "add" else -1.0)
         if op == "neg":
@@ -108,13 +108,13 @@ class Formulas:
         return {((self._atom_id(op, number, tuple(map(freeze, xs))), 1),): sign}
 
     def _multiply_sums(self, a: Sum, b: Sum) -> Sum:
-        """A product; a sum of several terms stays one factor, unless the other factor is a number."""
+        """The product of two sums; a sum of several terms stays one factor, unless the second factor is a number."""
         if not (a.keys() - {ONE} and b.keys() - {ONE}):
             return multiply(a, b)
         return multiply(*(x if len(x) == 1 else self._atom_of_sum(x, 1) for x in (a, b)))
 
     def _atom_of_sum(self, x: Sum, power: float) -> Sum:
-        """A sum in a power, as one atom, without what its coefficients have in common: its first term is positive."""
+        """A power of a sum as one atom, without its common coefficient and with a positive first term."""
         if len(x := self._shortest_form(x)) == 1:
             return self._take_power(x, power)
         sizes = {abs(c) for c in x.values()}
@@ -125,18 +125,18 @@ class Formulas:
         return {((self._atom_id("sum", -1, (freeze(unit),)), power),): size**power}
 
     def _term_rank(self, product: Product) -> tuple:
-        """The place of a term in a sum: coordinates, numbers, others."""
+        """The sort key of a term in a sum: terms with coordinates first, then numbers, then parameters."""
         moves = any(self.atoms[a].kind == "input" and not self._is_parameter(a) for a, _ in product)
         return not moves, product != ONE, product
 
     def _take_power(self, x: Sum, power: float) -> Sum:
         if len(x) != 1:
-            return self._atom_of_sum(x, power) if x else raised(self._atom_id("sum", -1, ((),)), power)
+            return self._atom_of_sum(x, power) if x else atom_power(self._atom_id("sum", -1, ((),)), power)
         ((product, c),) = x.items()
         plain = len(product) == 1 and product[0][1] == 1 and c == 1
         if power == int(power) or plain or (not product and c > 0):
             return {tuple((atom, power * p) for atom, p in product): c**power}
-        return raised(self._atom_id("sum", -1, (freeze(x),)), power)
+        return atom_power(self._atom_id("sum", -1, (freeze(x),)), power)
 
     # ---- the shortest form ----
 
@@ -150,22 +150,24 @@ class Formulas:
         return min(forms, key=self.length)
 
     def length(self, x: Sum) -> int:
-        """The operations of a sum as it is written."""
+        """The number of operations of a sum as it is printed."""
         factors = sum(max(0, len(product) - 1 + (abs(c) != 1)) for product, c in x.items())
         inner = sum(self.cost(atom) + (power != 1) for product in x for atom, power in product)
         return max(0, len(x) - 1) + factors + inner
 
     def cost(self, atom: int) -> int:
-        """The operations of an atom as it is written."""
+        """The number of operations of an atom as it is printed."""
         if atom not in self._costs:
             of = self.atoms[atom]
             self._costs[atom] = (of.kind not in ("input", "sum")) + sum(self.length(dict(x)) for x in of.operands)
         return self._costs[atom]
 
     def _multiply_out(self, x: Sum) -> Sum:
-        """The sum without whole powers of sums, as far as it stays short."""
+        """The sum with whole powers of sums expanded, as long as it has at most `MOST_TERMS` terms."""
         while True:
-            found = next(((product, k) for product in x for k in range(len(product)) if self._opens(*product[k])), None)
+            found = next(
+                ((product, k) for product in x for k in range(len(product)) if self._expands(*product[k])), None
+            )
             if found is None:
                 return x
             product, k = found
@@ -176,7 +178,7 @@ class Formulas:
                 return x
             x = add({key: c for key, c in x.items() if key != product}, opened, 1.0)
 
-    def _opens(self, atom: int, power: float) -> bool:
+    def _expands(self, atom: int, power: float) -> bool:
         return self.atoms[atom].kind == "sum" and power in range(1, LARGEST_POWER + 1)
 
     # ---- sines and cosines ----
@@ -187,11 +189,11 @@ class Formulas:
         return x
 
     def _join_products(self, x: Sum, product: Product) -> Sum | None:
-        """The sum with two of its products in one: `product`, and that with the other functions of both angles."""
+        """Merge `product` with its partner, that of the co-functions, by an addition theorem; None without one."""
         turns = [a for a, p in product for _ in range(min(2, int(p)) if p > 0 else 0) if self._is_angle_function(a)]
         for a, b in itertools.combinations(turns, 2):
-            rest = multiply({product: 1.0}, multiply(raised(a, -1), raised(b, -1)))
-            others = multiply(*(raised(self._co_function(of)) for of in (a, b)))
+            rest = multiply({product: 1.0}, multiply(atom_power(a, -1), atom_power(b, -1)))
+            others = multiply(*(atom_power(self._co_function(of)) for of in (a, b)))
             (partner,) = multiply(rest, others)
             if partner == product or abs(x[product]) != abs(x.get(partner, 0.0)):
                 continue
@@ -201,7 +203,7 @@ class Formulas:
         return None
 
     def _angle_sum(self, a: int, b: int, c: float, d: float) -> Sum | None:
-        """c f(a) g(b) + d f′(a) g′(b) as one function, with the other functions f′ and g′; None where it is none."""
+        """The sum c f(a) g(b) + d f′(a) g′(b) as one sine or cosine, f′ the co-function of f; None if it is none."""
         (f, u), (g, v) = ((self.atoms[k].kind, dict(self.atoms[k].operands[0])) for k in (a, b))
         if u == v and (f != g or c != d):
             return None  # cos² − sin² and sin cos stay
@@ -222,11 +224,11 @@ class Formulas:
     # ---- sums that are factors ----
 
     def _gather_factors(self, x: Sum) -> Sum:
-        """The sum with factors of several terms: sums that were written, and sums of parameters."""
+        """The sum factored by sums that the user wrote, and by sums of parameters."""
         for atom in sorted(self._written, key=lambda a: -len(self.atoms[a].operands[0])):
             terms = dict(self.atoms[atom].operands[0])
             while (found := _common_multiple(x, terms)) is not None:
-                shorter = self._replace(x, multiply(found, terms), multiply(found, raised(atom)))
+                shorter = self._replace(x, multiply(found, terms), multiply(found, atom_power(atom)))
                 if shorter is None or x.keys() == terms.keys():
                     break
                 x = shorter
@@ -244,7 +246,7 @@ class Formulas:
         return x
 
     def _replace(self, x: Sum, old: Sum, new: Sum) -> Sum | None:
-        """The sum with other terms; None where that is longer."""
+        """The sum with the terms `old` replaced by `new`; None if that is longer."""
         other = add(add(x, old, -1.0), new, 1.0)
         return other if self.length(other) <= self.length(x) else None
 
@@ -252,8 +254,8 @@ class Formulas:
         return self.atoms[atom].kind == "input" and self.atoms[atom].position >= self.moving
 
 
-def raised(atom: int, power: float = 1) -> Sum:
-    """A power of an atom."""
+def atom_power(atom: int, power: float = 1) -> Sum:
+    """The sum that is one power of an atom."""
     return {((atom, power),): 1.0}
 
 
@@ -262,7 +264,7 @@ def freeze(x: Sum) -> tuple:
 
 
 def add(a: Sum, b: Sum, factor: float) -> Sum:
-    """a + factor · b, without what cancels, to rounding."""
+    """The sum a + factor · b; terms that cancel to rounding are dropped."""
     result = dict(a)
     for product, c in b.items():
         before = result.get(product, 0.0)
@@ -275,7 +277,7 @@ def add(a: Sum, b: Sum, factor: float) -> Sum:
 
 
 def multiply(a: Sum, b: Sum) -> Sum:
-    """The product of two sums, term by term."""
+    """The product of two sums, expanded term by term."""
     result: Sum = {}
     for (x, c), (y, d) in itertools.product(a.items(), b.items()):
         powers = Counter(dict(x))
@@ -286,7 +288,7 @@ def multiply(a: Sum, b: Sum) -> Sum:
 
 
 def _common_multiple(x: Sum, terms: Sum) -> Sum | None:
-    """One product, with its coefficient, by which these terms are all in a sum."""
+    """A product and its coefficient, {product: c}, such that `terms` times it are all terms of x; None without one."""
     (lead, first), *others = terms.items()
     for product, c in x.items():
         (factor,) = multiply({product: 1.0}, {tuple((atom, -power) for atom, power in lead): 1.0})

@@ -1,20 +1,20 @@
 """The graph of a scalar program: one node per distinct scalar, simplified as it is added.
 
-A node is a triple `(op, operands, attribute)`; its id is its position in `Graph.nodes`, so operands always come first.
+A node is a triple `(op, operands, attribute)`; its id is its index in `Graph.nodes`, and operands precede their users.
 `op` is the name of an operation (`_operations.OPERATIONS`; those of `select` are predicate, value if false, value if
 true), or "input" (attribute: position) or "constant" (attribute: Python number). Equal triples share one id.
 
 Every node has a *kind*: "float" (whatever precision the inputs will have), "bool", or the name of an integer type.
 Constants are folded in float64.
 
-What may change in the last digits: constants multiply out (`2*(3*x)` is `6*x`), and add up where no large ones cancel;
-products of the same factors are one product, and sums of the same terms one sum, in whatever order they were written;
+Simplification may change the last digits of a result: constants multiply (`2*(3*x)` is `6*x`), and add where no large
+ones cancel; products of the same factors are one node, and sums of the same terms, in whatever order they were written;
 like terms are collected where that shortens a sum (`x + x` is `2*x`, `x - x` is 0); `sin(x)**2 + cos(x)**2` is 1;
-half-integer powers become roots. Nothing is multiplied out (but `_passes.factor` draws out common factors), and no
-quotient but one by a power of two.
+half-integer powers become roots. Products of sums are not expanded (`_passes.factor` draws out common factors), and a
+quotient stays one unless the divisor is a power of two.
 
-A zero found here is *structural*: `0*x` is 0 whatever `x` will be, so an infinity or NaN it would have met is not seen;
-whoever runs the program checks what comes out of it.
+A zero found here is *structural*: `0*x` is 0 whatever `x` will be, even an infinity or NaN; the caller that runs the
+program checks its results.
 """
 
 import functools
@@ -32,7 +32,7 @@ from lagjax._program._simplify import whole_power
 
 
 class Unlowerable(Exception):
-    """A function has no scalar program; the message is a sentence that says why."""
+    """Error: a function cannot be written as a scalar program; the message is a sentence that says why."""
 
 
 LONGEST_SUM = 16  # terms of a sum, or factors of a product, that are compared with others
@@ -49,12 +49,12 @@ _ONE = ("float", 1.0, 1.0)  # the key of the constant 1
 
 
 def _have_cancelled(a: float, b: float) -> bool:
-    """True for large constants whose sum is so small that what they were added to has been rounded."""
+    """True for large constants that nearly cancel, |a + b| < 1e-8 |a|: numbers added to a alone were rounded."""
     return abs(a + b) < 1e-8 * abs(a) and abs(a) > 1e8
 
 
 def find_ancestors(nodes: Sequence[Node], outputs: Iterable[int], powers: Mapping[int, tuple] = {}) -> list[int]:
-    """The nodes that some nodes depend on, and these, in order; those of `powers` depend on the base given there."""
+    """The ids of `outputs` and all nodes they depend on, ascending; of a node in `powers`, that is the base alone."""
     outputs, order = list(outputs), []
     marks = bytearray(1 + max(outputs, default=0))
     for i in outputs:
@@ -70,7 +70,7 @@ def find_ancestors(nodes: Sequence[Node], outputs: Iterable[int], powers: Mappin
 
 
 def find_readers(nodes: Sequence[Node]) -> list[list[int]]:
-    """For each node those that it is an operand of."""
+    """For each node, the ids of the nodes that have it as an operand."""
     readers: list[list[int]] = [[] for _ in nodes]
     for i, (_, operands, _) in enumerate(nodes):
         for x in operands:
@@ -79,7 +79,7 @@ def find_readers(nodes: Sequence[Node]) -> list[list[int]]:
 
 
 def find_descendants(readers: Sequence[Sequence[int]], starts: Iterable[int]) -> list[int]:
-    """The nodes that depend on some others, without these, in order; `readers` as `find_readers` gives them."""
+    """The ids, ascending, of all nodes that depend on `starts`, without these; `readers` is from `find_readers`."""
     found: set[int] = set()
     left = list(starts)
     while left:
@@ -90,7 +90,7 @@ def find_descendants(readers: Sequence[Sequence[int]], starts: Iterable[int]) ->
 
 
 class _NodeIndex(NamedTuple):
-    """The products and sums of a graph, known by what they consist of."""
+    """Tables to find a product of a graph by its factors and a sum by its terms."""
 
     factors: dict[int, tuple[int, ...]]  # of each product
     terms: dict[int, dict[int, float]]  # of each sum, with their coefficients
@@ -100,10 +100,10 @@ class _NodeIndex(NamedTuple):
 
 
 class Graph:
-    """Scalars under construction. `apply` is the one door: it folds, simplifies and shares before it adds a node.
+    """A scalar program under construction; `apply` simplifies and shares before it adds a node.
 
-    `budget` is the largest number of operations; one more raises `Unlowerable`. The first `moving` numbers among the
-    inputs vary along a motion and are differentiated by: no look-up reads them as a table, which has no slope.
+    `budget` is the largest number of operations; one more raises `Unlowerable`. The first `moving` inputs vary along a
+    motion and derivatives are taken by them, so that `take` never reads them as entries of a table, which has no slope.
     """
 
     def __init__(self, budget: int, moving: int = 0):
@@ -122,7 +122,7 @@ class Graph:
 
     @classmethod
     def from_line(cls, line, budget: int) -> "Graph":
-        """A graph of the nodes of a straight line, which have their positions as ids."""
+        """The graph with the nodes of a straight line, each with its index in the line as id."""
         graph = cls(budget)
         graph.nodes, graph.kinds = list(line.nodes), list(line.kinds)
         for i, (node, kind) in enumerate(zip(graph.nodes, graph.kinds, strict=True)):
@@ -133,13 +133,13 @@ class Graph:
         return graph
 
     def find_ancestors(self, outputs: Iterable[int], as_derived: bool = False) -> list[int]:
-        """The nodes that some nodes depend on, and these, in order; `as_derived`, powers depend on their base."""
+        """The ids of `outputs` and all nodes they depend on, ascending; `as_derived`: of a power, the base alone."""
         return find_ancestors(self.nodes, outputs, self.powers if as_derived else {})
 
     # ---- what overflows where it no longer matters, as cosh u in 1/cosh u ----
 
     def grows(self, i: int) -> bool:
-        """True if a node may come near the largest double where nothing else does: what is made of exponentials."""
+        """True if node i may overflow although the inputs are moderate: exponentials and what is computed from them."""
         growing = self._growing
         for op, operands, _ in self.nodes[len(growing) : i + 1]:
             by_operand = any(growing[j] for j in operands)
@@ -149,33 +149,33 @@ class Graph:
 
     @property
     def hides_growth(self) -> bool:
-        """True if anything is divided by what grows, or is another function of it."""
+        """True if the graph divides by a node that `grows`, or applies a function to one: an overflow may not show."""
         self.grows(len(self.nodes) - 1)
         return self._hides_growth
 
     def is_huge(self, v: int) -> int:
-        """True where v is so large that its coefficients may be infinite: the square of 1/v is zero."""
+        """The node of a flag: v is so large, (1/v)² = 0, that its Taylor coefficients may be infinite."""
         first = len(self.nodes)
-        return self._check_growth(first, self._is_zero(self.apply("div", self.constant(1.0, "float"), v)))
+        return self._mark_bounded(first, self._is_zero(self.apply("div", self.constant(1.0, "float"), v)))
 
     def has_coefficients(self, v: int) -> int:
-        """True where v is neither huge nor NaN."""
+        """The node of a flag: v is neither huge (`is_huge`) nor NaN, so that its Taylor coefficients are finite."""
         first, zero = len(self.nodes), self.constant(0.0, "float")
         inverse = self.apply("div", self.constant(1.0, "float"), v)
-        return self._check_growth(first, self.apply("prefers", self.apply("mul", inverse, inverse), zero))
+        return self._mark_bounded(first, self.apply("prefers", self.apply("mul", inverse, inverse), zero))
 
     def finite_part(self, v: int) -> int:
         has_any, first = self.has_coefficients(v), len(self.nodes)
-        return self._check_growth(first, self.apply("select", has_any, self.constant(0.0, "float"), v))
+        return self._mark_bounded(first, self.apply("select", has_any, self.constant(0.0, "float"), v))
 
     def is_flat_quotient(self, w: int, v: int) -> int:
-        """True where w = u/v is nothing as v is huge."""
+        """The node of a flag: w = u/v is zero because v is huge, so that its derivatives are zero."""
         return self.apply("and", self.is_huge(v), self._is_zero(w))
 
     def is_flat_far_out(self, slope: int, u: int) -> int:
-        """The node of a flag: true where u is huge and slope · u is zero.
+        """The node of a flag: u is huge and slope · u is zero, so that the function is constant there.
 
-        At u = 0 it is false, although the product is zero there, too; and 0 · ∞ is NaN.
+        It is false at u = 0, where the product is zero too, and where the product is 0 · ∞ = NaN.
         """
         change = self.apply("mul", slope, u)
         changes = self.apply("prefers", self.apply("mul", change, change), self.constant(0.0, "float"))
@@ -184,8 +184,8 @@ class Graph:
     def _is_zero(self, x: int) -> int:
         return self.apply("eq", self.apply("mul", x, x), self.constant(0.0, "float"))
 
-    def _check_growth(self, first: int, result: int) -> int:
-        """The result, where nodes from the `first` one on do not grow."""
+    def _mark_bounded(self, first: int, result: int) -> int:
+        """Return `result`, and mark the nodes from id `first` on as not growing."""
         self.grows(first - 1)
         self._growing += [False] * (len(self.nodes) - first)
         return result
@@ -193,11 +193,11 @@ class Graph:
     # ---- operations ----
 
     def branch(self, predicate: int) -> AbstractContextManager:
-        """A context in which a branch of a `cond` is written that is taken where the predicate holds."""
+        """A context for the operations of a branch of `lax.cond` with this predicate, which `Tape` records."""
         return nullcontext()
 
     def apply(self, op: str, *operands: int, attribute=None) -> int:
-        """The scalar `op(*operands)`, as simple as the rules below make it."""
+        """The node of `op(*operands)` after simplification: a constant, an existing node or a new one."""
         for i in operands:
             if self.nodes[i][0] != "constant":
                 break
@@ -212,11 +212,11 @@ class Graph:
             raise Unlowerable(f"the function takes more than the {self.budget} scalar operations allowed by `budget`")
 
     def power(self, a: int, exponent: int) -> int:
-        """The scalar `a**exponent`, for any whole exponent."""
+        """The node of `a**exponent` for a whole exponent of any sign."""
         return whole_power(self, a, exponent)
 
     def node(self, op: str, *operands: int, attribute: Any = None) -> int:
-        """The node with exactly these operands: an old one if there is one."""
+        """The node with exactly these operands, without simplification: the existing one if there is one."""
         if OPERATIONS[op].commutative and operands[0] > operands[1]:
             operands = operands[::-1]
         key = (op, operands, attribute)
@@ -232,7 +232,7 @@ class Graph:
         return self._append_node(node, node, kind) if known is None else known
 
     def real(self, i: int) -> int:
-        """The node of an id that may stand for an input or a number without one."""
+        """The node of an id that may be virtual: an input (from `INPUTS` on) or an array entry (from `NUMBERS` on)."""
         if i < INPUTS:
             return i
         if i < NUMBERS:
@@ -243,7 +243,7 @@ class Graph:
         return self.constant(float(np.frombuffer(numbers)[i - first]), "float")
 
     def position(self, i: int) -> int | None:
-        """The input that an id is, or None."""
+        """The position of the input that an id stands for; None for any other node."""
         if i >= NUMBERS:
             return None
         if i >= INPUTS:
@@ -252,13 +252,13 @@ class Graph:
         return attribute if op == "input" else None
 
     def array(self, numbers: np.ndarray) -> np.ndarray:
-        """Ids of the numbers of a long array, in its shape."""
+        """Ids, in the shape of `numbers`, of the entries of a long array of float64; no nodes are made for them."""
         data = np.ascontiguousarray(numbers, np.float64).tobytes()
         first = self._arrays.setdefault(data, NUMBERS + sum(map(len, self._arrays)) // 8)
         return np.arange(first, first + numbers.size).reshape(numbers.shape)
 
     def array_of(self, i: int) -> tuple[bytes, int]:
-        """The long array that an id is a number of, and where its ids begin."""
+        """The bytes of the long array to which id i belongs, and the id of its first entry."""
         return next(array for array in reversed(self._arrays.items()) if array[1] <= i)
 
     def constant(self, value, kind: str) -> int:
@@ -278,7 +278,7 @@ class Graph:
         return attribute if op == "constant" else None
 
     def operand_of(self, op: str, i: int) -> int | None:
-        """`x` if node `i` is `op(x)`, else None."""
+        """The operand x if node i is `op(x)`, else None."""
         return self.nodes[i][1][0] if self.nodes[i][0] == op else None
 
     def _append_node(self, key, node: Node, kind: str) -> int:
@@ -295,7 +295,7 @@ class Graph:
         return self.constant(OPERATIONS[op].value(*values, *extra), self._result_kind(op, operands, attribute))
 
     def _fold_look_up(self, op: str, x: int, attribute: Any) -> int:
-        """A look-up at a number: an entry is that input, or a number."""
+        """A look-up with a constant index: the entry as a constant or an input; `locate` by inputs stays a node."""
         value, table = self.nodes[x][2], table_of(attribute)
         if table.numbers is not None:
             return self.constant(float(look_up(op, attribute, (), value)), "float")
@@ -322,7 +322,7 @@ class Graph:
         return 1.0, i
 
     def scale(self, coefficient: float, base: int) -> int:
-        """`coefficient * base`; the sign is kept outside, where a sum or product can absorb it."""
+        """The node of `coefficient * base`; a sign becomes an outer negation, which a sum or product can absorb."""
         if coefficient == 0:
             return self.constant(0, self.kinds[base])
         if coefficient < 0:
@@ -336,7 +336,7 @@ class Graph:
     # Products and sums are known by what they consist of, whatever order they were written in.
 
     def product(self, a: int, b: int) -> int:
-        """`a * b`, or an earlier product of the same factors."""
+        """The node of `a * b`: an existing product with the same factors if there is one."""
         factors = tuple(sorted(self._collected.factors.get(a, (a,)) + self._collected.factors.get(b, (b,))))
         if len(factors) > LONGEST_SUM:
             return self.node("mul", a, b)
@@ -348,7 +348,7 @@ class Graph:
         return product
 
     def terms(self, i: int) -> dict[int, float]:
-        """A sum as {base: coefficient}; a number is a multiple of 1."""
+        """Node i as a linear combination {base: coefficient}; a constant is a multiple of the node 1."""
         if (value := self.value(i)) is not None:
             return {self.constant(1, "float"): value}
         coefficient, base = self.term(i)
@@ -357,7 +357,7 @@ class Graph:
         return {base: coefficient}
 
     def sum(self, a: int, b: int, sign: int) -> int:
-        """`a + sign*b` with like terms collected, or an earlier sum of the same terms."""
+        """The node of `a + sign*b` with like terms collected: an existing sum of the same terms if there is one."""
         left, right = self.terms(a), self.terms(b)
         one = self._ids.get(_ONE)
         if one in left and one in right and _have_cancelled(left[one], sign * right[one]):
@@ -378,7 +378,7 @@ class Graph:
         return self._find_sum(terms, a, b, sign)
 
     def _round_by_adding(self, a: int, b: int, sign: int) -> int:
-        """`a + sign*b`, of which large constants cancel: u + 1.5·2ᵏ − 1.5·2ᵏ is u to the nearest 2ᵏ⁻⁵²."""
+        """The node of `a + sign*b` where large constants cancel: u + 1.5·2ᵏ − 1.5·2ᵏ is u in multiples of 2ᵏ⁻⁵²."""
         one, taken = self.constant(1, "float"), a if self.value(b) is None else b
         terms, large = self.terms(a if taken == b else b), self.value(taken)
         if large is None or abs(terms[one]) != abs(large) or abs(math.frexp(large)[0]) != 0.75:
@@ -397,7 +397,7 @@ class Graph:
         return total
 
     def _find_sum(self, terms: dict[int, float], a: int, b: int, sign: int) -> int:
-        """`a + sign*b`, which is the sum of `terms`: an earlier node, or its negative, if there is one."""
+        """The node of `a + sign*b`, with collected `terms`: an existing sum, its negative, or a new one."""
         first = -1.0 if terms[min(terms)] < 0 else 1.0  # a sum and its negative are known by one key
         key = frozenset(terms.items() if first > 0 else [(x, -c) for x, c in terms.items()])
         if (known := self._collected.sums.get(key)) is not None:
@@ -408,7 +408,7 @@ class Graph:
         return self.scale(coefficient, base)
 
     def _signed_sum(self, a: int, b: int, sign: int) -> int:
-        """The node `a + sign*b`, with signs drawn out of the operands."""
+        """The node of `a + sign*b`, with negations of a and b absorbed into the sign."""
         for_a, for_b = self.operand_of("neg", a), self.operand_of("neg", b)
         if for_b is not None:
             b, sign = for_b, -sign
@@ -419,7 +419,7 @@ class Graph:
         return self.apply("neg", self.node("add", for_a, b))
 
     def _pythagoras(self, terms: dict[int, float]) -> None:
-        """Replace `c*sin(x)**2*y + c*cos(x)**2*y` by `c*y`, in place."""
+        """Replace `c*sin(x)**2*y + c*cos(x)**2*y` by `c*y` in a dict of terms, in place."""
         for base in list(terms):
             factors = self._collected.factors.get(base, ())
             for k, (sine, other) in enumerate(itertools.pairwise(factors)):
@@ -438,12 +438,12 @@ class Graph:
 
 
 class Tape(Graph):
-    """Scalars as they are written, one node for each operation: what reverse mode goes through.
+    """A scalar program recorded operation by operation, without simplification or sharing, for reverse mode.
 
-    In a graph that shares equal scalars the cotangents of all their uses come together in one sum. That hides what
-    cancels: in ∂L/∂q − (∂p/∂q) q̇ the kinetic part of one use of cos q cancels, and its potential part does not.
+    In a graph that shares equal scalars, the cotangents of all uses of one scalar are added up. That separates terms
+    that cancel: in ∂L/∂q − (∂p/∂q) q̇ the kinetic part of one use of cos q cancels, and its potential part does not.
 
-    `branches` has the predicate of every node from a branch of a `cond`, of which no cotangent leaves it elsewhere.
+    `branches` maps a node from a branch of a `cond` to its predicate: where that is false, the cotangent is zero.
     """
 
     def __init__(self, budget: int, moving: int = 0):
@@ -464,7 +464,7 @@ class Tape(Graph):
         return self._append_operation(op, operands, attribute, self._result_kind(op, operands, attribute))
 
     def power(self, a: int, exponent: int) -> int:
-        """The scalar `a**exponent`, as one node."""
+        """The node of `a**exponent`, recorded as one operation."""
         if self.value(a) is not None or self.kinds[a] != "float":
             return super().power(a, exponent)
         return self._append_operation("integer_pow", (a,), exponent, "float")

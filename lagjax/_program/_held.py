@@ -1,10 +1,10 @@
-"""The accelerations of a motion along borders that hold it, and its state on them where a step begins.
+"""The accelerations along borders that a motion slides on, and the projection of its state onto them.
 
-What the equations of the shares leave is rounding, which a body at rest would gather to ½ ε t². So the acceleration of
-one coordinate of each border, its *pivot*, follows from u̇ = 0 itself: it is zero where u is a velocity alone. And a
-step begins on its borders: the *retraction* puts the velocity back on u = 0, along what the border's force moves, and
-the position where u depends on that alone. Its derivative is that of a motion whose start is varied: off the border by
-δu, on either side, the force brings it back at once.
+The equations for the shares leave rounding errors, which a body at rest would integrate to ½ ε t². So the acceleration
+of one coordinate per border, its *pivot*, is computed from u̇ = 0: exactly zero where u is a velocity. And a step
+begins on its borders: the *retraction* moves the velocity to u = 0, in the direction of the border's force, and the
+position if u depends on it alone. Its derivative is that of a motion with a varied start: a displacement δu off the
+border, to either side, is removed at once.
 """
 
 from collections import Counter
@@ -18,10 +18,10 @@ from lagjax._program._series import StraightLine
 from lagjax._program._small_equations import Eliminated, Sparse, constants, dot, drop_entry, transpose
 
 
-class Coupled(NamedTuple):
-    """The borders that hold, and A z = r: A z − Σ μₖ actsₖ = r, normalsₖ · z = endₖ; `equations` are those of μ.
+class BorderEquations(NamedTuple):
+    """Equations of borders that hold the motion: A z − Σ μₖ actsₖ = r, normalsₖ · z = endₖ; `equations` are those of μ.
 
-    Of each pivot: its border, its coordinate, 1 where it is free, and the inverse of its slope where the border holds.
+    A pivot has: its border, its coordinate, 1 where it is free, and 1 / slope where the border holds.
     """
 
     acts: list[Sparse]
@@ -29,44 +29,44 @@ class Coupled(NamedTuple):
     equations: Eliminated
     pivots: list[tuple[int, int, int, int]]
 
-    def rename(self, place: Callable[[int], int]) -> "Coupled":
-        """The same of nodes of another graph."""
+    def rename(self, place: Callable[[int], int]) -> "BorderEquations":
+        """The equations with node ids replaced by `place(id)`, for use in another graph."""
 
         def place_rows(rows: list[Sparse]) -> list[Sparse]:
             return [{i: place(x) for i, x in row.items()} for row in rows]
 
         acts, normals, *equations = map(place_rows, (self.acts, self.normals, *self.equations))
         pivots = [(k, i, place(free), place(inverse)) for k, i, free, inverse in self.pivots]
-        return Coupled(acts, normals, Eliminated(*equations), pivots)
+        return BorderEquations(acts, normals, Eliminated(*equations), pivots)
 
-    def push(self, graph: Graph, right: Sequence[int], mu: Sequence[int]) -> list[int]:
-        """r + Σ μₖ actsₖ."""
+    def add_forces(self, graph: Graph, right: Sequence[int], mu: Sequence[int]) -> list[int]:
+        """The right-hand side r with the border forces: r + Σ μₖ actsₖ."""
         pushed = list(right)
         for act, x in zip(self.acts, mu, strict=True):
             for i, c in act.items():
                 pushed[i] = graph.apply("add", pushed[i], graph.apply("mul", c, x))
         return pushed
 
-    def missing(self, graph: Graph, z: Sequence[int], ends: Sequence[int]) -> list[int]:
-        """The `ends` less the rates of the borders."""
+    def border_residuals(self, graph: Graph, z: Sequence[int], ends: Sequence[int]) -> list[int]:
+        """The residuals endₖ − normalsₖ · z of the border equations."""
         rates = (dot(graph, d.values(), [z[i] for i in d]) for d in self.normals)
         return [graph.apply("sub", end, rate) for end, rate in zip(ends, rates, strict=True)]
 
-    def mend(self, graph: Graph, solve: Callable, z: list[int], mu: list[int], ends) -> tuple[list[int], list[int]]:
-        """z and μ with what rounding has left of the rates taken once more: `solve` gives z of A z = r."""
-        more = self.equations.solve(graph, self.missing(graph, z, ends))
-        rest = solve(self.push(graph, [graph.number(0.0)] * len(z), more))
+    def refine(self, graph: Graph, solve: Callable, z: list[int], mu: list[int], ends) -> tuple[list[int], list[int]]:
+        """One step of iterative refinement of z and μ for the border residuals; `solve(r)` gives z of A z = r."""
+        more = self.equations.solve(graph, self.border_residuals(graph, z, ends))
+        rest = solve(self.add_forces(graph, [graph.number(0.0)] * len(z), more))
         return (
             [graph.apply("add", *pair) for pair in zip(z, rest, strict=True)],
             [graph.apply("add", *pair) for pair in zip(mu, more, strict=True)],
         )
 
     def solve(self, graph: Graph, solve: Callable, right: Sequence[int], ends: Sequence[int]) -> list[int]:
-        """z and μ, behind each other."""
-        mu = self.equations.solve(graph, self.missing(graph, solve(right), ends))
-        z = solve(self.push(graph, right, mu))
+        """The list z + μ that solves both equations; `solve(r)` gives z of A z = r, `ends` are the endₖ."""
+        mu = self.equations.solve(graph, self.border_residuals(graph, solve(right), ends))
+        z = solve(self.add_forces(graph, right, mu))
         if len(self.pivots) < len(self.acts):
-            z, mu = self.mend(graph, solve, z, mu, ends)
+            z, mu = self.refine(graph, solve, z, mu, ends)
         for k, i, free, inverse in self.pivots:
             others = drop_entry(self.normals[k], i)
             end = graph.apply("sub", ends[k], dot(graph, others.values(), [z[j] for j in others]))
@@ -74,11 +74,11 @@ class Coupled(NamedTuple):
         return z + mu
 
 
-class Held:
-    """Accelerations, and a state, on the borders that hold: those that are `pushed` onto.
+class HeldMotion:
+    """The accelerations and the state (q, q̇) on the borders that hold: those whose flag in `pushed` is true.
 
-    `slopes` are ∂u̇/∂q̈ of each border, `responses` the accelerations by each piece, `pivots` as `choose_pivots` gives
-    them. The state begins as the inputs of the program.
+    `slopes` are ∂u̇/∂q̈ of each border, `responses` the accelerations caused by each piece, `pivots` are from
+    `choose_pivots`. The state starts as the inputs of the program; `set_back` changes it.
     """
 
     def __init__(self, graph: Graph, n: int, pushed: Sequence[int], slopes, responses, pivots):
@@ -89,15 +89,15 @@ class Held:
         self.state = {i: graph.input(i, "float") for i in range(2 * n)}
 
     def pivots(self) -> list[tuple[int, int, int, int]]:
-        """Each border, its pivot, 1 where the pivot is free, and the inverse of its slope where the border holds."""
+        """For each pivot: border, coordinate, 1 where the pivot is free, and 1 / slope where the border holds."""
         f, zero, one = self.graph.apply, self.zero, self.one
         return [
             (k, i, f("select", self.pushed[k], one, zero), f("select", self.pushed[k], zero, f("div", one, divisor)))
             for k, i, divisor in self.divisors
         ]
 
-    def hold(self, z: Sequence[int], rates: Sequence[int]) -> list[int]:
-        """Accelerations with those of pivots from Σ ∂u̇/∂q̈ᵢ q̈ᵢ = `rates`."""
+    def solve_pivots(self, z: Sequence[int], rates: Sequence[int]) -> list[int]:
+        """Accelerations z with those of the pivots replaced by the solution of Σ ∂u̇/∂q̈ᵢ q̈ᵢ = rateₖ."""
         f, z = self.graph.apply, list(z)
         for k, i, divisor in self.divisors:
             row = drop_entry(self.slopes[k], i)
@@ -105,13 +105,13 @@ class Held:
             z[i] = f("select", self.pushed[k], z[i], f("div", f("sub", rates[k], others), divisor))
         return z
 
-    def put_back(
+    def set_back(
         self, first: int, which: Sequence[int], levels: Sequence[int], solve: Callable, pushed: Sequence[int]
     ) -> None:
-        """Move the state from `first` on to zero `levels` of the borders `which`, all along what their forces move.
+        """Move the state, from index `first` on, so that the `levels` of the borders `which` become zero.
 
-        `solve` gives the multiples of `responses` that change the levels by given numbers, where borders are `pushed`
-        onto. Then pivots move alone, by what rounding and one step of Newton's have left.
+        `solve(levels)` gives multiples of `responses` that change the levels by these numbers where both sides push
+        (`pushed`). Then the pivots alone remove what rounding and one Newton step leave.
         """
         f, state, n, pushed_of = self.graph.apply, self.state, self.n, dict(zip(which, pushed, strict=True))
         left = zip(which, self._evaluate_held(levels), strict=True)
@@ -139,7 +139,7 @@ class Held:
         return [places[i] for i in line.outputs]
 
     def finish(self) -> tuple[StraightLine, tuple[frozenset[int], ...]]:
-        """The line from the inputs of the program to the state, and which coordinates each border moves."""
+        """The line from the inputs of the program to the state, and the set of coordinates that each border moves."""
         graph = self.graph
         line = eliminate_dead_code(graph, [self.state[i] for i in range(2 * self.n)])
         moved = ({i: x for i, x in response.items() if i < self.n} for response in self.responses)
@@ -147,10 +147,10 @@ class Held:
 
 
 def choose_pivots(rows: Sequence[dict[int, float | None]]) -> list[tuple[int, int]]:
-    """Borders, each with a coordinate that can follow from the others, in an order in which none changes one before.
+    """Choose pivots (border, coordinate), ordered so that setting one coordinate leaves earlier borders unchanged.
 
-    `rows` has the slopes ∂u̇/∂q̈ᵢ of each border that are not zero, None for those that are no constants. A pivot is
-    alone in its row, or has the largest constant of it, so that it gathers no rounding. A border may have none.
+    `rows` has the nonzero slopes ∂u̇/∂q̈ᵢ of each border, None for those that vary. A pivot is alone in its row or has
+    the largest constant there, so that rounding does not grow. A border may have none.
     """
     left, behind, times = dict(enumerate(rows)), [], Counter(i for row in rows for i in row)
 

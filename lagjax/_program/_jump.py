@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._program._borders import Borders, Pieced
+from lagjax._program._borders import Borders, PiecedProgram
 from lagjax._program._differentiation import TangentTable, copy_nodes, pullback_and_entries, tangents_in, with_tangents
 from lagjax._program._graph import Graph, Unlowerable
 from lagjax._program._look_ups import Table, shift_look_up
@@ -45,9 +45,10 @@ _LARGEST_JUMP = 1000  # operations that one may become: a bound for errors
 
 
 class Nesting(NamedTuple):
-    """A motion of `base` coordinates, its tangents along `directions[0]` directions, tangents of both along the next.
+    """The layout of a motion of `base` coordinates with its tangents, tangents of all these, and so on.
 
-    The coordinates stand row after row: those of the motion, of its tangents, then of the tangents of all these rows.
+    `directions[k]` is the number of directions at level k. Rows of coordinates follow each other: the motion, its
+    tangents, then the tangents of all rows before.
     """
 
     base: int
@@ -59,12 +60,12 @@ class Nesting(NamedTuple):
 
     @property
     def levels(self) -> list[tuple[int, int]]:
-        """The coordinates whose tangents each level has, and the number of directions of these tangents."""
+        """For each level: the number of coordinates before it, and the number of directions of their tangents."""
         return [(Nesting(self.base, self.directions[:k]).size, count) for k, count in enumerate(self.directions)]
 
     @property
     def disjoint_rows(self) -> list[tuple[int, int, int]]:
-        """Rows, each with two others that are derivatives along some of its directions, and none along both."""
+        """Triples of rows (a + b, a, b): derivatives along directions of which none is shared by a and b."""
         counts, found = [1 + count for count in self.directions], []
         place = functools.partial(np.ravel_multi_index, dims=counts, order="F")
         for index in itertools.product(*map(range, counts)):
@@ -83,14 +84,14 @@ Jet = list  # of nodes of a graph, one a row: the number itself, then its deriva
 
 
 class Jump(NamedTuple):
-    """The jump of the tangents of a motion over n coordinates: rows of them, as `line` takes and gives them.
+    """The jump of the tangents of a motion with n coordinates at a border, as a straight line over their rows.
 
     `line` takes the lower rows of q, of q̇, t, the lower rows of the parameters, the m pieces before and behind the
-    border, m numbers that choose the switching number Σ hⱼ uⱼ, then the upper rows of q, of q̇ and of the parameters:
-    those that move along the last directions. Where levels are entries of tables of parameters, the numbers of the m
-    entries stand behind the hⱼ, and uⱼ is less its level. It gives the jumps of q and q̇, row after row from row 1 on,
-    then the accelerations before and behind the border. `orders` says how many derivatives each row is, `fixed` how
-    many of the inputs belong to no row.
+    border, m numbers hⱼ that select the switching number Σ hⱼ uⱼ, then the upper rows of q, of q̇ and of the
+    parameters: those along the last directions. If levels are table entries that are parameters, the m indices of the
+    entries follow the hⱼ, and uⱼ is meant minus its level. Outputs are the jumps of q and q̇ by rows from row 1 on,
+    then the accelerations before and behind the border. `orders` has the order of derivative of each row, `lower` the
+    number of lower rows, `fixed` that of inputs without rows.
     """
 
     line: StraightLine
@@ -99,15 +100,15 @@ class Jump(NamedTuple):
     fixed: int
 
     def accelerations(self, size: int) -> StraightLine:
-        """The line from the same inputs to the accelerations before and behind the border alone."""
+        """The line from the same inputs to the accelerations before and behind the border only."""
         return eliminate_dead_code(self.line, self.line.outputs[-2 * size :])
 
     def transposed(self, size: int, parameters: int) -> tuple[StraightLine, tuple[Table, ...]]:
-        """The line from all but the upper rows, and cotangents of their jumps, to cotangents of these rows.
+        """The line from all inputs but the upper rows, and cotangents of their jumps, to cotangents of the upper rows.
 
-        The upper rows are as many as the lower ones, for along one direction they are linear. Cotangents come and go
-        row after row; those of a row are of q and q̇, and where they go to also of its parameters. Behind them come the
-        cotangents of entries of tables, as `pullback_and_entries` gives them.
+        There are as many upper rows as lower ones: the jump is linear in tangents along one direction. Cotangents are
+        ordered by rows, each with q and q̇, and in the outputs also the parameters. Cotangents of table entries follow,
+        as in `pullback_and_entries`.
         """
         n, rows = size, self.lower
         first = rows * (2 * n + parameters) + 1 + self.fixed
@@ -145,10 +146,10 @@ class Jump(NamedTuple):
 
 
 def with_borders_of_tangents(borders: Borders, size: int, directions: int, member: int) -> Borders:
-    """The borders of a motion together with its tangents along this many directions; along a piece these are smooth.
+    """The borders of a motion together with its tangents along `directions` directions D; between borders it is smooth.
 
-    The inputs q, q̇ and the parameters have 1 + D rows, those of the motion and then one for each direction, and so have
-    the accelerations. The motion has this many of the numbers of a `member`, of which tables look up some.
+    The inputs q, q̇ and parameters have 1 + D rows, the motion and then one for each direction, and so have the
+    accelerations. `member` is the number of parameters of a member, some of which are read by look-ups only.
     """
     program, pieces, n, rows = borders.program, len(borders.switches), size, 1 + directions
     numbers = program.size - 2 * n - 1 - pieces
@@ -173,7 +174,7 @@ def with_borders_of_tangents(borders: Borders, size: int, directions: int, membe
     line = line.replace(outputs=line.outputs[: rows * n + 1])
     moved = zip(borders.decisions, switches[:pieces], strict=True)
     return borders._replace(
-        program=Pieced(line, len(dtypes), dtypes, None),
+        program=PiecedProgram(line, len(dtypes), dtypes, None),
         decisions=tuple(decision._replace(switch=node) for decision, node in moved), arguments=switches[pieces:],
         decide=_renumber_inputs(borders.decide, decided), motion=borders.motion or borders,
         holding=holding._replace(retraction=retraction, release=_renumber_inputs(holding.release, decided)),
@@ -181,7 +182,7 @@ def with_borders_of_tangents(borders: Borders, size: int, directions: int, membe
 
 
 def row_places(n: int, numbers: int, rows: int, row: int) -> list[int]:
-    """The places of q, q̇, t and the numbers of a row among the inputs of a motion with rows."""
+    """The positions of q, q̇, t and the parameters of one row among the inputs of a motion with `rows` rows."""
     first = 2 * rows * n + 1
     return [
         *range(row * n, (row + 1) * n), *range((rows + row) * n, (rows + row + 1) * n), 2 * rows * n,
@@ -190,7 +191,7 @@ def row_places(n: int, numbers: int, rows: int, row: int) -> list[int]:
 
 
 def _table_of_row(shift: int) -> TangentTable:
-    """The table of a row of tangents, which stands this many numbers of a member behind that of the motion."""
+    """A map from a table of the motion to that of a row of tangents, whose parameters come `shift` positions later."""
     return lambda table: shift_look_up(table, shift)
 
 
@@ -204,10 +205,10 @@ def _renumber_inputs(line: StraightLine, places: dict[int, int]) -> StraightLine
 def jump_at_border(
     borders: Borders, size: int, directions: tuple[int, ...], member: int, over_steps: bool = False
 ) -> Jump:
-    """The jump of the tangents of a motion, of tangents of these and so on, along this many `directions` each.
+    """The jump of the tangents at a border; `directions[k]` is the number of directions of the tangents of level k.
 
-    `borders` are those of the motion alone, which has this many of the numbers of a `member`. The last tangents may be
-    those of a derivative `over_steps` that have been taken. Raises `Unlowerable` for more than four kinds of them.
+    `borders` are those of the motion without tangents, `member` is the number of parameters of a member. `over_steps`:
+    the last level differentiates steps that were taken. Raises `Unlowerable` for more than four levels.
     """
     if len(directions) > len(_STAGES):
         raise Unlowerable(
@@ -218,9 +219,10 @@ def jump_at_border(
 
 
 class _Jets:
-    """Numbers with all their derivatives: row (i₁, i₂, …) is that along direction i₁ of the first kind, …
+    """Arithmetic of jets: a number with all its mixed derivatives, one per row (i₁, i₂, …).
 
-    A direction 0 is none. Rows are numbered with i₁ as the first to change.
+    Row (i₁, i₂, …) is the derivative along direction i₁ of the first level, i₂ of the second, …; 0 means no derivative.
+    The first index changes fastest.
     """
 
     def __init__(self, directions: tuple[int, ...]):
@@ -236,7 +238,7 @@ class _Jets:
             self._terms.append([(place[a], place[b]) for a, b in pairs])
 
     def multiply(self, a: Jet, b: Jet) -> Jet:
-        """Their product, by Leibniz's rule."""
+        """The product of two jets, by Leibniz's rule."""
         apply, result = self.graph.apply, []
         for terms in self._terms:
             total = None
@@ -248,7 +250,7 @@ class _Jets:
         return result
 
     def add(self, a: Jet, b: Jet, factor: float = 1.0) -> Jet:
-        """a + factor · b."""
+        """The jet a + factor · b."""
         graph, result = self.graph, []
         for x, y in zip(a, b, strict=True):
             scaled = None if y is None else graph.apply("mul", graph.number(factor), y)
@@ -257,7 +259,7 @@ class _Jets:
 
 
 class _JumpBuilder:
-    """Builds the jump of state and tangents across a border in one graph, whose numbers are jets."""
+    """The construction of the jump of state and tangents at a border in one graph, in the arithmetic of jets."""
 
     def __init__(self, borders: Borders, size: int, directions: tuple[int, ...], member: int, over_steps: bool):
         program = borders.program
@@ -282,11 +284,11 @@ class _JumpBuilder:
 
     @property
     def moving(self) -> int:
-        """The count of the inputs of a row."""
+        """The number of inputs in a row: q, q̇, t and parameters."""
         return 2 * self.n + 1 + self.numbers
 
     def _add_rows(self, line: StraightLine, dtypes: Sequence, fixed: int) -> StraightLine:
-        """A line of inputs that move, and `fixed` others, with all rows of its outputs; rows of inputs alike."""
+        """The line with all rows of its inputs and outputs; `fixed` inputs at its end have no rows."""
         outputs, rows, moving = len(line.outputs), 1, self.moving
         first, directions = self.jets.rows * moving, self.jets.directions
         kinds = [*dtypes, *[np.dtype(float)] * (first - moving + fixed)]
@@ -305,7 +307,7 @@ class _JumpBuilder:
         return line
 
     def _jet_values(self, line: StraightLine, place: list[Jet], fixed: Sequence[int]) -> list[Jet]:
-        """The outputs of one of the lines with rows at a place; `fixed` are the inputs that do not move."""
+        """The outputs, as jets, of a line with rows at jets `place` of its moving inputs and nodes `fixed`."""
         zero = self.graph.number(0.0)
         inputs = [zero if jet[row] is None else jet[row] for row in range(self.jets.rows) for jet in place]
         nodes = copy_nodes(self.graph, line, [*inputs, *fixed])
@@ -315,7 +317,7 @@ class _JumpBuilder:
     # ---- flows ----
 
     def _moving_rates(self, place: list[Jet], pieces: Sequence[int]) -> list[Jet]:
-        """The rates of all that moves: q̇, q̈, 1 of the time, 0 of parameters."""
+        """The time derivatives, as jets, of all moving inputs: q̇, q̈, 1 for the time, 0 for parameters."""
         unused = [self.graph.number(0.0)] * self.chosen
         none: Jet = [None] * self.jets.rows
         one: Jet = [self.graph.number(1.0), *none[1:]]
@@ -335,7 +337,7 @@ class _JumpBuilder:
         raise AssertionError
 
     def _delay_jets(self, place: list[Jet], before: Sequence[int], hit: Sequence[int], rate: int) -> Jet:
-        """δ, order by order: what is left of u is due to the highest one."""
+        """The jet of the delay δ, order by order: the residual of u, divided by −u̇ (`rate`), gives the next order."""
         delay: Jet = [None] * self.jets.rows
         for order in range(1, 1 + max(self.jets.orders)):
             there = place if order == 1 else self._flow_jets(place, before, delay)
@@ -372,7 +374,7 @@ class _JumpBuilder:
         return Jump(line, self.jets.orders, self._lower_jets, 2 * self.pieces + self.chosen)
 
     def _jump_inputs(self) -> tuple[list[Jet], list[int], list[int], list[int]]:
-        """The inputs of the result, in the order of `Jump`: the jets of all that moves, and pieces."""
+        """The inputs in the order of `Jump`: jets of moving inputs, pieces before and behind, selecting numbers."""
         n, numbers, lower, m = self.n, self.numbers, self._lower_jets, self.pieces
         rows, count = self.jets.rows, itertools.count()
         upper = rows - lower
@@ -392,9 +394,10 @@ class _JumpBuilder:
 
 
 def _switching_number(borders: Borders, size: int) -> StraightLine:
-    """Σ hⱼ (uⱼ − levelⱼ), with the numbers hⱼ behind the inputs of the program.
+    """The line of Σ hⱼ (uⱼ − levelⱼ), with the weights hⱼ after the inputs of the program.
 
-    Levels that are parameters are entries of tables, whose numbers are inputs behind these. Others do not matter.
+    Levels that are parameters are entries of tables, whose indices are inputs after the weights; constant levels, which
+    have no derivative, are left out.
     """
     program, m = borders.program, len(borders.switches)
     line = eliminate_dead_code(program.line, borders.switches)

@@ -1,4 +1,4 @@
-"""With which pieces a program jumps, found at random states of borders: a corner is zero to rounding, a jump is not."""
+"""A search, at random states on borders, for the pieces with which a program jumps; a corner is continuous."""
 
 from collections.abc import Callable, Sequence
 
@@ -23,7 +23,7 @@ _NOISE, _HIT, _EPS = 1e3, 100.0, float(np.finfo(float).eps)
 
 
 class BothSides:
-    """A line on both sides of a border in one graph: its `size` inputs, the m pieces before it, the m behind it."""
+    """Two copies of a line in one graph, `before` and `behind` a border: the same `size` inputs, m pieces each."""
 
     def __init__(self, graph: Graph, line: StraightLine, size: int, m: int):
         self.graph, self.line = graph, line
@@ -32,7 +32,7 @@ class BothSides:
         self._node_differences: dict[int, int] = {}
 
     def difference(self, i: int) -> int:
-        """The node behind the border less that before it: terms that are alike do not cost its digits."""
+        """The node of the difference of node i, behind minus before the border; equal terms cancel exactly."""
         stack = [i]
         while stack:
             k = stack[-1]
@@ -48,7 +48,7 @@ class BothSides:
         return self._node_differences[i]
 
     def _differing_operands(self, k: int) -> list[int]:
-        """The operands from whose differences that of a node follows."""
+        """The operands of node k whose differences determine that of k; empty if it has to be subtracted as a whole."""
         (op, operands, _), same = self.line.nodes[k], self._is_unchanged
         if same(k):
             return []
@@ -77,7 +77,7 @@ class BothSides:
 
 
 class JumpSearch:
-    """The search for the pieces of a program with which some of its numbers jump."""
+    """A search, at random states on their borders, for the pieces with which nodes of a program jump."""
 
     def __init__(self, decided: DecidedProgram):
         line, decide, self.decisions = decided.line, decide_pieces(decided, ()), decided.decisions
@@ -86,20 +86,20 @@ class JumpSearch:
         tables = [table for table in map(table_of, located) if table.numbers is None]
         self.beside = self.size + 3 * self.m  # where numbers that are only looked up stand, behind all other inputs
         self.line, self.decide = self._shift_look_ups(line), self._shift_look_ups(decide)
-        self.draw, self.tables = np.random.default_rng(0), [self._near(table) for table in dict.fromkeys(tables)]
+        self.draw, self.tables = np.random.default_rng(0), [self._shift_table(table) for table in dict.fromkeys(tables)]
 
-    def _near(self, attribute):
-        """A look-up in the columns of this search."""
+    def _shift_table(self, attribute):
+        """The look-up attribute with its table moved to the columns of this search."""
         table = table_of(attribute)
         beside = table.numbers is None and table.first >= BESIDE
         return shift_look_up(attribute, self.beside - BESIDE) if beside else attribute
 
     def _shift_look_ups(self, line: StraightLine) -> StraightLine:
-        nodes = ((op, of, self._near(a) if op in LOOK_UPS else a) for op, of, a in line.nodes)
+        nodes = ((op, of, self._shift_table(a) if op in LOOK_UPS else a) for op, of, a in line.nodes)
         return line.replace(nodes=tuple(nodes))
 
     def _draw_states(self, count: int) -> np.ndarray:
-        """Random states; entries of tables that are parameters increase."""
+        """Random inputs (inputs, count); entries of tables that are parameters are increasing."""
         ends = [1 + max(table.positions) for table in self.tables]
         columns = self.draw.uniform(0.3, 1.2, (max([self.beside, *ends]), count))
         columns[: self.moving] *= self.draw.choice([-1.0, 1.0], (self.moving, count))
@@ -108,7 +108,7 @@ class JumpSearch:
         return columns
 
     def _decide_pieces(self, columns: np.ndarray, given: np.ndarray, pieces: np.ndarray) -> np.ndarray:
-        """The pieces (m, S) of states; piece `given` (S,) of each is one of `pieces` (S,), where that is not NaN."""
+        """The pieces (m, S) at S states; piece `given[s]` of state s is set to `pieces[s]` unless that is NaN."""
         m, first, states = self.m, self.size, np.arange(columns.shape[1])
         columns = columns.copy()
         columns[first : first + 2 * m] = 0.0
@@ -119,7 +119,7 @@ class JumpSearch:
         return found
 
     def find(self, candidates: Sequence[int], nodes: Sequence[int]) -> dict[int, bool | None]:
-        """For each of these pieces: whether any of the nodes jumps with it; None where no state is on its border."""
+        """For each candidate piece: does any of the nodes jump with it? None if no state on its border was found."""
         with np.errstate(all="ignore"):
             columns, near, blocks = self._locate_borders(candidates)
             values = np.array(self._node_differences(nodes).evaluate(list(columns)))
@@ -132,7 +132,7 @@ class JumpSearch:
         }
 
     def find_zeros(self, candidates: Sequence[int], node: int) -> list[bool]:
-        """For each of these pieces: whether the node is zero on one side of its border, wherever that is found."""
+        """For each candidate piece: is the node zero on one side of its border, at all states found there?"""
         line = self._add_rounding(eliminate_dead_code(self.line, [node]), 1)
         with np.errstate(all="ignore"):
             columns, near, blocks = self._locate_borders(candidates)
@@ -147,7 +147,7 @@ class JumpSearch:
         return [bool(near[block].any() and any(side[block].all() for side in zero)) for block in blocks]
 
     def _locate_borders(self, candidates) -> tuple[np.ndarray, np.ndarray, list[slice]]:
-        """States on the borders of pieces, with the pieces of both sides; which are there, and which are of each."""
+        """States on borders with the pieces of both sides (inputs, S), a mask (S,), the slice of each candidate."""
         m, size = self.m, self.size
         columns, given = self._draw_states(_STATES * len(candidates)), np.repeat(candidates, _STATES)
         lines, target = [self._switching_distance(j) for j in candidates], np.full((3, len(given)), np.nan)
@@ -173,7 +173,7 @@ class JumpSearch:
 
     def _table_entries(self, columns: np.ndarray) -> Callable:
         def entries(located, index: np.ndarray) -> np.ndarray:
-            table = self._near(table_of(located))
+            table = self._shift_table(table_of(located))
             if table.numbers is not None:
                 return table.entries[index]
             return columns[table.first + table.stride * index, np.arange(len(index))]
@@ -181,14 +181,14 @@ class JumpSearch:
         return entries
 
     def _node_differences(self, nodes: Sequence[int]) -> StraightLine:
-        """The differences of nodes on both sides, and the rounding errors of these."""
+        """The line of the differences of nodes between both sides of a border, followed by their rounding errors."""
         graph = Graph(_LARGEST_SEARCH * len(self.line.nodes) + 10_000)
         sides = BothSides(graph, self.line, self.size, self.m)
         changes = [sides.difference(i) for i in nodes]
         return self._add_rounding(eliminate_dead_code(graph, changes), len(changes))
 
     def _switching_distance(self, j: int) -> StraightLine:
-        """Switching number j, its rounding error, and its slopes by q, q̇ and t."""
+        """The line of switching number j, its rounding error, and its derivatives by q, q̇ and t."""
         line = eliminate_dead_code(self.line, [self.decisions[j].switch])
         return self._add_rounding(line, 1, range(self.moving))
 

@@ -1,18 +1,18 @@
-"""The kick of a motion at a border at which L jumps: its velocities behind the border, from those before it.
+"""The kick at a border where L jumps: the velocities behind it from those before it.
 
-A motion is an extremal of ∫ L dt across the border u(q, t) = 0, too. With p = ∂L/∂q̇, h = p·q̇ − L and constraints
-G q̇ = −d this says (Weierstrass and Erdmann's corner conditions)
+Across the border u(q, t) = 0 the motion still makes ∫ L dt stationary. With p = ∂L/∂q̇, h = p·q̇ − L and constraints G
+q̇ = −d this implies the corner conditions of Weierstrass and Erdmann,
 
     p⁺ = p⁻ + μ ∇u + Gᵀλ,    h⁺ = h⁻ − μ ∂u/∂t − λ·d,    G q̇⁺ = −d.
 
-Where u depends on the time alone, μ is not needed: p is continuous but for the constraints' impulses. Where it depends
-on q, p is continuous along the border. For L = ½ q̇·M q̇ + a·q̇ − V both conditions have a closed form: with w the
+Where u depends on time alone, μ is not needed: p is continuous but for the constraints' impulses. Where it depends on
+q, p is continuous along the border. For L = ½ q̇·M q̇ + a·q̇ − V both conditions have a closed form: with w the
 velocities for μ = 0, and M n = ∇u + Gᵀν, G n = 0,
 
     q̇⁺ = w + μ n,    u̇⁺² = b² + 2 c (h⁻ − h⁺(w) − λ·d),    b = ∇u·w + ∂u/∂t,  c = ∇u·n,  μ = (u̇⁺ − b) / c,
 
-and u̇⁺ has the sign of u̇⁻. Where the right side is negative the energy does not suffice: the motion is reflected, which
-is the same with both sides alike and u̇⁺ = −u̇⁻. Source: Gelfand & Fomin, *Calculus of Variations*, §15.
+and u̇⁺ has the sign of u̇⁻. Where the right side is negative the energy does not suffice and the motion is reflected:
+the same formula with equal sides and u̇⁺ = −u̇⁻. Source: Gelfand & Fomin, *Calculus of Variations*, §15.
 """
 
 import functools
@@ -31,7 +31,7 @@ from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._series import StraightLine
 from lagjax._program._small_equations import dot, eliminate, sparse_row, substitute
 
-BENT = "a constraint prescribes a speed that jumps"  # a reason to refuse a kick
+JUMPING_CONSTRAINT = "a constraint prescribes a speed that jumps"  # a reason to refuse a kick
 _BY_VELOCITY = "L or the momentum p = dL/dqdot jumps, and no law gives the velocities after it"
 _NOT_QUADRATIC = (
     "L or the momentum p = dL/dqdot jumps, and L is not quadratic in qdot, so that the velocities behind that are not "
@@ -39,12 +39,12 @@ _NOT_QUADRATIC = (
 )
 # The part of its terms by which the rate of a constraint has to jump: less is rounding of where the border is, and
 # the impulse that it asks for changes velocities by no more.
-TURNED = 1e-9
+RATE_JUMP_TOLERANCE = 1e-9
 _LARGEST_KICK = 60  # operations that one may become: a bound for errors
 
 
 class Mechanics(NamedTuple):
-    """The nodes that the corner conditions are made of: L, p (n,), M (n, n), G (m, n), the rates G q̇ + d and d (m,)."""
+    """The nodes in the corner conditions: L, p (n,), M (n, n), G (m, n), the constraint rates G q̇ + d and d (m,)."""
 
     lagrangian: int
     momentum: tuple[int, ...]
@@ -62,11 +62,12 @@ class Mechanics(NamedTuple):
 
 
 class Kick(NamedTuple):
-    """The kick at borders at which L jumps.
+    """The kick at borders where L jumps.
 
-    `line` takes q, q̇, t, the parameters, the m pieces before and behind the border, then the numbers that choose the
-    switching number (`_jump.Jump`). It gives q̇ behind it, and whether the motion passes: 0 where it is reflected, then
-    with the pieces before it on both sides. `pieces` are those with which L jumps; some are `refused`, for a reason.
+    `line` takes q, q̇, t, the parameters, the m pieces before and behind the border, then the weights of the switching
+    numbers (`_jump.Jump`). It gives q̇ behind the border, and 1 if the motion passes, 0 if it is reflected, in which
+    case it is called with equal pieces on both sides. `pieces` are those with which L jumps; `refused` ones have no
+    law.
     """
 
     line: StraightLine
@@ -77,10 +78,10 @@ class Kick(NamedTuple):
 # ---- with which pieces L jumps ---------------------------------------------------------------------------------------
 
 
-def find_kicking(decided: DecidedProgram, count: int) -> dict[int, str | None]:
-    """The pieces with which L or p jumps, each with the reason why no closed form holds there, or None.
+def find_kicking_pieces(decided: DecidedProgram, count: int) -> dict[int, str | None]:
+    """The pieces with which L or p jumps, each with the reason why no closed form exists, or None if one does.
 
-    The last `count` outputs are the nodes of `Mechanics`.
+    The last `count` outputs of the program are the nodes of `Mechanics`.
     """
     line, n, first = decided.line, decided.n, decided.first
     of, search, jumping = Mechanics.from_nodes(line.outputs[-count:], n), JumpSearch(decided), {}
@@ -101,7 +102,7 @@ def find_kicking(decided: DecidedProgram, count: int) -> dict[int, str | None]:
     for j, by_constraint in jumping.items():
         reasons[j] = None if is_quadratic else _NOT_QUADRATIC
         if by_constraint:
-            reasons[j] = BENT
+            reasons[j] = JUMPING_CONSTRAINT
         elif reads_velocity([decided.decisions[j].switch]):
             reasons[j] = _BY_VELOCITY
     return reasons
@@ -110,13 +111,13 @@ def find_kicking(decided: DecidedProgram, count: int) -> dict[int, str | None]:
 # ---- the closed form -------------------------------------------------------------------------------------------------
 
 
-def kick_of(
+def build_kick(
     line: StraightLine, n: int, size: int, decisions: Sequence[Decision], count: int, kicking: dict[int, str | None]
 ) -> Kick:
-    """The kick of a program of `size` inputs and the pieces; its last `count` outputs are those of `Mechanics`."""
+    """The kick of a program with `size` inputs before its pieces; its last `count` outputs are those of `Mechanics`."""
     spatial = [j for j in kicking if not inputs_below(line, [decisions[j].switch]).isdisjoint(range(n))]
     # At corners where the rate of a constraint jumps, velocities are NaN: no law gives those after it.
-    corners = [j for j in spatial if kicking[j] == BENT]
+    corners = [j for j in spatial if kicking[j] == JUMPING_CONSTRAINT]
     refused = tuple((j, reason) for j, reason in kicking.items() if reason is not None and j not in corners)
     if refused:
         return Kick(StraightLine((), (), ()), tuple(kicking), refused)
@@ -140,7 +141,7 @@ def kick_of(
 
 
 def _rate_jumps(graph: Graph, sides: BothSides, of: Mechanics, n: int) -> int:
-    """True where a rate of a constraint jumps at this state: elsewhere a piece may bend it that is none of it here."""
+    """The flag that the rate of a constraint jumps at this state; a piece may bend it at other states only."""
     f, turns = graph.apply, graph.constant(False, "bool")
     for k, rate in enumerate(of.rates):
         row, v = of.jacobian[k * n : (k + 1) * n], [graph.input(n + i, "float") for i in range(n)]
@@ -148,7 +149,7 @@ def _rate_jumps(graph: Graph, sides: BothSides, of: Mechanics, n: int) -> int:
         slope, speed = (
             functools.reduce(lambda a, x: f("add", a, f("abs", x)), xs, graph.number(0.0)) for xs in (row, v)
         )
-        bound = f("mul", graph.number(TURNED), f("mul", slope, speed))
+        bound = f("mul", graph.number(RATE_JUMP_TOLERANCE), f("mul", slope, speed))
         turns = f("or", turns, f("lt", bound, f("abs", sides.difference(rate))))
     return turns
 
@@ -156,7 +157,7 @@ def _rate_jumps(graph: Graph, sides: BothSides, of: Mechanics, n: int) -> int:
 def _kick_velocities(
     graph: Graph, sides: BothSides, mechanics: Mechanics, slopes: Sequence[int], passes: int
 ) -> tuple[list[int], int]:
-    """The velocities behind u = 0, of these `slopes` by positions and time, and 1 if the energy suffices, else 0."""
+    """The velocities behind u = 0, and 1 if the energy suffices, else 0; `slopes` are those of u by (q, t)."""
     n, f, zero, one, behind = len(slopes) - 1, graph.apply, graph.number(0.0), graph.number(1.0), sides.behind
     v, normal, by_time = [graph.input(n + i, "float") for i in range(n)], slopes[:n], slopes[n]
     change_p, change_l = [sides.difference(i) for i in mechanics.momentum], sides.difference(mechanics.lagrangian)
@@ -184,7 +185,7 @@ def _kick_velocities(
 
 
 def _solve_saddle(graph: Graph, mass: Sequence[int], jacobian: Sequence[int], n: int):
-    """`(r, c)`: d and −λ with M d − Gᵀλ = r, G d = c."""
+    """A function `(r, c)` → d, −λ that solves M d − Gᵀλ = r, G d = c."""
     m, zero = len(jacobian) // n if n else 0, graph.constant(0.0, "float")
     rows = [[*mass[i * n : (i + 1) * n], *(jacobian[k * n + i] for k in range(m))] for i in range(n)]
     rows += [[*jacobian[k * n : (k + 1) * n], *[zero] * m] for k in range(m)]

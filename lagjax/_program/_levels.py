@@ -1,13 +1,14 @@
-"""The levels between the pieces of a switching number, as formulas and as the guards of a kernel.
+"""The levels that separate the pieces of a switching number u, as formulas and as the guards of a kernel.
 
-    SIGN     the sign of a switching number u: −1, 0 or 1
+    kind     piece
+    SIGN     the sign of u: −1, 0 or 1
     FLOOR    the whole number below u
     TRUNC    the whole number between u and zero
-    TABLE    the piece of an increasing table that u is on; CLOCK, where u is the time, whose borders are known
+    TABLE    the interval of an increasing table that contains u; CLOCK where u is the time, whose borders are known
     CONE     1 where a vector of velocities of length u moves, −1 where it rests
     SLIDE    1 where the motion slides along the border of another piece
 
-A *guard* is a border of a piece: σ (u − level) > 0 on it, with σ = ±1.
+A *guard* is one border of a piece as an inequality, σ (u − level) > 0 with σ = ±1, that holds on the piece.
 """
 
 import math
@@ -26,14 +27,14 @@ FAR = 1e100  # from a border that is not there; a share that is beyond 0 and 1: 
 
 
 class Decision(NamedTuple):
-    """The decision of a piece: its kind, its switching number, a node, and the table of a `TABLE` or `CLOCK`."""
+    """A decision: its kind, the node of its switching number, and for `TABLE` and `CLOCK` its table."""
 
     kind: int
     switch: int
     table: Located | None = None
 
     def piece(self, graph: Graph, x: int) -> int:
-        """The piece that a switching number x is on."""
+        """The node of the piece that contains switching number x."""
         f, number = graph.apply, graph.number
         if self.table is not None:
             return f("locate", x, attribute=self.table)
@@ -45,7 +46,7 @@ class Decision(NamedTuple):
         return below if self.kind == FLOOR else f("select", f("lt", x, number(0.0)), below, f("ceil", x))
 
     def level(self, graph: Graph, piece: int) -> int:
-        """The level between a piece and the next one, of the switching number."""
+        """The node of the level of the switching number between `piece` and the next one."""
         f, zero, above = graph.apply, graph.number(0.0), graph.apply("add", piece, graph.number(1.0))
         if self.kind in (SIGN, CONE):
             return zero
@@ -55,7 +56,7 @@ class Decision(NamedTuple):
         return above if self.kind == FLOOR else f("select", f("lt", piece, zero), above, piece)
 
     def distances(self, graph: Graph, x: int, piece: int) -> tuple[int, int]:
-        """The distances of a switching number x, no sign's, from the borders below and above its piece."""
+        """The nodes of the distances of switching number x from the borders below and above; not for `SIGN`."""
         f, number = graph.apply, graph.number
         below = f("sub", x, self.level(graph, f("sub", piece, number(1.0))))
         if self.table is not None:
@@ -63,7 +64,7 @@ class Decision(NamedTuple):
         return below, f("sub", self.level(graph, piece), x)
 
     def levels_near(self, u: np.ndarray, entries: Callable, draw: np.random.Generator) -> tuple:
-        """Levels near switching numbers u (S,), and the pieces below and above; `entries(located, index)` of tables."""
+        """Levels near switching numbers u (S,), and the pieces on both sides; `entries(located, i)` reads a table."""
         if self.kind == SIGN:
             return np.zeros_like(u), -np.ones_like(u), np.ones_like(u)
         if self.table is not None:
@@ -78,7 +79,7 @@ class Decision(NamedTuple):
 
 
 class Affine(NamedTuple):
-    """`slope` p + `offset`, of a piece p."""
+    """The map p ↦ `slope` p + `offset` of a piece p."""
 
     slope: float
     offset: float
@@ -88,7 +89,7 @@ class Affine(NamedTuple):
 
 
 class Level(NamedTuple):
-    """`slope` p + `offset`, of a piece p, and `below` more where p ≤ 0, `above` more where p ≥ 0."""
+    """The level of a piece p: `slope` p + `offset`, plus `below` where p ≤ 0, plus `above` where p ≥ 0."""
 
     slope: float = 0.0
     offset: float = 0.0
@@ -96,21 +97,21 @@ class Level(NamedTuple):
     above: float = 0.0
 
     def __call__(self, piece, number_where: Callable):
-        """The level of a piece; `number_where(condition, x)` is x where the condition holds, else 0."""
+        """The level of a piece; `number_where(condition, x)` gives x where the condition holds, else 0."""
         level = piece * self.slope + self.offset + number_where(piece <= 0.0, self.below)
         return level + number_where(piece >= 0.0, self.above)
 
 
 class Guard(NamedTuple):
-    """A border of piece number `piece`: of its switching number u, σ (u − level) > 0, with σ = ±1 the `side`.
+    """A border of piece number `piece` as an inequality of its switching number u: σ (u − level) > 0, σ = ±1 = `side`.
 
     Beyond it the piece is `beyond`, whose border on this side is guard `back`.
 
-    Where both sides push onto the border of `piece`, piece number `slide` becomes 1: the motion slides along it, with
-    α of the acceleration on the upper side and 1 − α of that on the lower one; its piece is the one below, and guard
-    `rest` the border. α is the switching number of `slide`; beyond its guards the motion continues with the guard `on`
-    at a piece that is larger by `gains`. These are −1 where there is none. `order` is that of the rate of u that is
-    zero there (`_sliding.Slide`). Where `of_table` is 1 the level is the entry of that number of the piece's table.
+    Where both sides push onto the border, piece number `slide` becomes 1: the motion slides along it, with fraction α
+    of the acceleration on the upper side and 1 − α of that on the lower one; `piece` is the lower one, and guard `rest`
+    the border. α is the switching number of `slide`; beyond its guards the motion continues at guard `on`, with a piece
+    larger by `gains`. −1 means none. `order` is the order of the rate of u that is zero there (`_border_forces.Slide`).
+    With `of_table` 1, `level` is an index into the table of the piece.
     """
 
     piece: int
@@ -127,10 +128,10 @@ class Guard(NamedTuple):
 
 
 def list_guards(kinds: Sequence[int], slides: Sequence[Slide]) -> tuple[Guard, ...]:
-    """The guards of all pieces; piece number `slides[k].piece` slides where the k-th of the last ones is 1.
+    """The guards of all pieces; the last pieces are flags, the k-th of which is 1 while piece `slides[k].piece` slides.
 
-    Those of one piece stand side by side: of several that are violated where no time passes the first one counts, and
-    this many borders that push onto each other come to rest (Murty, Linear Algebra Appl. 9 (1974) 65).
+    Guards of one piece are adjacent: of several violated at one instant the first one is handled first, with which all
+    borders that push onto each other come to rest (Murty, Linear Algebra Appl. 9 (1974) 65).
     """
     guards: list[Guard] = []
     as_it_is, zero = Affine(1.0, 0.0), Level()

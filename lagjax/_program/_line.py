@@ -1,7 +1,7 @@
-"""A straight line of scalar operations, and its values in NumPy: for many states at once, and without a compiler.
+"""A straight-line program of scalar operations, and its evaluation in NumPy at many states at once.
 
-Every node becomes one NumPy operation on a vector of states. That costs a microsecond a node and about a nanosecond a
-node and state: less than XLA or LLVM take to compile a program, as long as it is not evaluated millions of times.
+Every node becomes one NumPy operation on a vector of states. That costs a microsecond per node and about a nanosecond
+per node and state: less than XLA or LLVM take to compile, unless the program is evaluated millions of times.
 """
 
 import functools
@@ -26,11 +26,11 @@ _MOST_KEPT = 2**24
 
 @dataclass(frozen=True, eq=False)
 class StraightLine:
-    """Operations in order, as in `Program`; as a key it is equal to nothing but itself.
+    """A scalar program as a tuple of nodes in the order of execution; two lines are equal only if they are one object.
 
-    What NumPy needs of it is derived once and lives as long as the line. Its functions take one column for each input:
-    a number, () or (1,), or one number for each of S states, (S,). Floats have the precision of the float columns, and
-    nothing raises or warns.
+    The NumPy form is derived once and kept with the line. Its methods take one column per input: a number, (), or (1,),
+    or one number per state, (S,). Floats have the precision of the float columns, and no floating-point error raises or
+    warns.
     """
 
     nodes: tuple[Node, ...]
@@ -41,7 +41,7 @@ class StraightLine:
         return replace(self, **fields)
 
     def constant(self, output: int) -> float | None:
-        """The value of an output that does not depend on the inputs, else None."""
+        """The value of an output (given by its index) that does not depend on the inputs, else None."""
         op, _, attribute = self.nodes[self.outputs[output]]
         return attribute if op == "constant" else None
 
@@ -51,11 +51,11 @@ class StraightLine:
 
     @functools.cached_property
     def looks_up(self) -> bool:
-        """True if it reads tables (see `_look_ups`)."""
+        """True if the line contains `take` or `locate` (see `_look_ups`)."""
         return any(op in LOOK_UPS for op, _, _ in self.nodes)
 
     def evaluate(self, columns: Sequence) -> np.ndarray:
-        """The outputs at many states, shape (outputs, S). Values are dropped as soon as nothing needs them."""
+        """The outputs at S states, shape (outputs, S); intermediate values are freed after their last use."""
         columns, precision, count = self._prepare_columns(columns)
         results = np.empty((len(self.outputs), count), precision)
         steps = self._numpy_steps(precision)
@@ -69,11 +69,11 @@ class StraightLine:
 
     @np.errstate(all="ignore")
     def vjp(self, columns: Sequence, cotangents: Sequence) -> list:
-        """Σ cotangentₖ ∂outputₖ/∂input for every input, each of shape (S,); None where nothing flows there.
+        """The cotangent Σ cotangentₖ ∂outputₖ/∂input of every input, each (S,); None where no output depends on it.
 
-        It is the derivative of this straight line of operations, in reverse as JAX would take it: NaN where a branch
-        that `select` does not take has no derivative. The user's own rules do not count. A cotangent is a number, an
-        array that broadcasts with the columns, or None.
+        It transposes the operations as JAX does in reverse mode: NaN where the branch that `select` does not take has
+        no derivative. Derivative rules of the user are not applied. A cotangent is a number, an array that broadcasts,
+        or None.
         """
         columns, precision, count = self._prepare_columns(columns)
         states = max([count, *[np.size(x) for x in cotangents]])
@@ -100,7 +100,7 @@ class StraightLine:
         return inputs
 
     def _scaled_partials(self, k: int, values: Sequence) -> Iterator[tuple[int, Callable]]:
-        """The float operands of node k that are no constants, each with x ↦ x ∂node/∂operand at these values."""
+        """For each float operand of node k that is not constant: its id, and the map g ↦ g ∂node/∂operand."""
         op, operands, _ = self.nodes[k]
         of = [values[i] for i in operands]
         for i, partial in zip(operands, OPERATIONS[op].transpose() if operands else (), strict=False):
@@ -115,7 +115,7 @@ class StraightLine:
 
     @functools.cached_property
     def _numpy_steps(self) -> Callable[[np.dtype], list]:
-        """Its calls of NumPy one after the other, by precision: they take longer to write down than to do."""
+        """A cached function from a precision to the list of NumPy calls that evaluates the line (`_steps_of`)."""
         return functools.cache(functools.partial(_steps_of, self))
 
     @functools.cached_property
@@ -127,7 +127,7 @@ class StraightLine:
         return kinds
 
     def _prepare_columns(self, columns) -> tuple[list[np.ndarray], np.dtype, int]:
-        """The columns as arrays of their kinds, the precision of floats, and the number of states."""
+        """The columns as arrays of the kinds of their inputs, the precision of floats, and the number of states."""
         read = {i: np.asarray(columns[i]) for i in self._inputs}  # unused columns are passed on as they are
         floats = [x.dtype for i, x in read.items() if self._inputs[i] == "float"]
         precision = np.result_type(*floats) if floats else np.dtype(float)
@@ -138,7 +138,7 @@ class StraightLine:
 
 
 def _cut(x, part: slice) -> Any:
-    """The entries of some states; a number that all states share is returned as it is."""
+    """The entries `part` of a column (S,); a number shared by all states, or None, is returned unchanged."""
     return x if x is None or np.size(x) == 1 else x[part]
 
 
@@ -150,7 +150,7 @@ def _dtype(kind: str, precision: np.dtype) -> np.dtype:
 
 
 def _steps_of(line: StraightLine, precision) -> list[tuple[Callable | None, tuple, tuple[bool, Any], tuple[int, ...]]]:
-    """The function of every node, its operands, attribute or constant, and the values that it is the last to use."""
+    """For each node: its NumPy function, operands, attribute or constant, and the nodes whose values are freed then."""
     last = {i: k for k, (_, operands, _) in enumerate(line.nodes) for i in operands}
     kept, dropped = set(line.outputs), {}
     for i, k in last.items():

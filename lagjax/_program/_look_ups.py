@@ -1,12 +1,12 @@
-"""Look-ups in tables: what a scalar program reads of arrays that are too long to be scalars of it.
+"""Look-ups in tables: how a scalar program reads arrays that are too long to have a node for every entry.
 
 An array of 25 000 samples is one `Table`, not 25 000 inputs. Two operations read it, both constant along a step:
 
-    take     an entry, by an index that is rounded to nothing: it is a whole number already; clipped to the table
-    locate   how many entries of an increasing table are at most x, less one: the piece of it that x is on
+    take     an entry, by an index that is a whole number already; it is clipped to the table
+    locate   the number of entries of an increasing table that are at most x, less one: the interval that contains x
 
-An entry is an input of the program, or a number of the program itself. Derivatives by the entries are sparse: `take`
-passes its tangent on from the same place of a table of tangents, and its cotangent to one place (`_differentiation`).
+An entry is an input or a constant of the program. Derivatives by the entries are sparse: the tangent of `take` is taken
+from the same index of a table of tangents, and its cotangent belongs to one entry (`_differentiation`).
 """
 
 from collections.abc import Callable, Sequence
@@ -19,10 +19,10 @@ BESIDE = 2**40
 
 
 class Table(NamedTuple):
-    """Entry i is input `first` + i `stride` of the program, for i from 0 up to `count`.
+    """A table in a program: entry i is input `first` + i `stride`, for 0 ≤ i < `count`.
 
-    Where `numbers` are there, the bytes of float64, it is that one of them instead. Where `tangents` is set, it is the
-    tangent of that input, in a program whose inputs do not include it.
+    With `numbers`, the bytes of a float64 array, entry i is that element of it instead. With `tangents`, it is the
+    tangent of that input, in a program whose inputs do not include the input itself.
     """
 
     first: int
@@ -39,7 +39,7 @@ class Table(NamedTuple):
         return numbers[self.first : self.first + self.stride * (self.count - 1) + 1 : self.stride]
 
     def moved(self, places: "Sequence[int] | dict[int, int]") -> "Table":
-        """The table of a program whose input `places[i]` is what input i was."""
+        """The table in a program where input i has become input `places[i]`."""
         first = places[self.first]
         stride = places[self.first + self.stride] - first if self.count > 1 else 1
         return self._replace(first=first, stride=stride)
@@ -52,7 +52,7 @@ class Table(NamedTuple):
 
 
 class Located(NamedTuple):
-    """The attribute of `locate`: an increasing table, and whether its last entry still belongs to the last piece."""
+    """The attribute of `locate`: an increasing table; `closed`: x equal to its last entry is in the last interval."""
 
     table: Table
     closed: bool
@@ -66,24 +66,24 @@ _LookUp = TypeVar("_LookUp", Table, Located)
 
 
 def _with_table(attribute: _LookUp, move: Callable[[Table], Table]) -> _LookUp:
-    """A look-up in the table that `move` gives for its own; numbers of the program are where they are."""
+    """The look-up attribute with its table replaced by `move(table)`; a table of constants is kept."""
     if isinstance(attribute, Located):
         return attribute._replace(table=_with_table(attribute.table, move))
     return attribute if attribute.numbers is not None else move(attribute)
 
 
 def shift_look_up(attribute: _LookUp, by: int) -> _LookUp:
-    """The look-up of a program whose inputs have positions larger by `by`."""
+    """The look-up attribute in a program whose inputs have moved up by `by` positions."""
     return _with_table(attribute, lambda table: table._replace(first=table.first + by))
 
 
 def move_look_up(attribute: _LookUp, places: Sequence[int]) -> _LookUp:
-    """A look-up in a program whose input `places[i]` is what input i was; numbers of a member stay what they are."""
+    """The look-up attribute in a program where input i is now `places[i]`; tables from `BESIDE` on keep their place."""
     return _with_table(attribute, lambda table: table if table.first >= BESIDE else table.moved(places))
 
 
 def look_up(op: str, attribute: Any, columns: Sequence, x) -> np.ndarray:
-    """The result of `take` or `locate` at many states, (S,); `columns` holds a number or (S,) for every input."""
+    """The values of `take` or `locate` at S states, (S,); `columns` has a number or an array (S,) for every input."""
     table, x = table_of(attribute), np.asarray(x)
     if table.numbers is not None:
         entries = table.entries
@@ -102,7 +102,7 @@ def look_up(op: str, attribute: Any, columns: Sequence, x) -> np.ndarray:
 
 
 def cotangents(table: Table, index, g) -> dict[int, np.ndarray]:
-    """The cotangents of the inputs, (S,) each, from the cotangent g of entries `index` at many states."""
+    """The cotangents {input: (S,)} of table entries, from the cotangent g (S,) of the entries at `index` (S,)."""
     if not len(table.positions):
         return {}
     index = np.clip(np.where(np.isnan(index), 0, index), 0, table.count - 1).astype(int)

@@ -1,4 +1,4 @@
-"""Memory while graphs of millions of nodes grow: what they may take of it."""
+"""The memory of this machine, and how much of it graphs of millions of nodes may take."""
 
 import os
 from pathlib import Path
@@ -9,7 +9,7 @@ _LIMIT = Path("/sys/fs/cgroup/memory.max")  # of a container
 
 
 def machine_memory() -> int:
-    """The bytes of memory that this machine, or the container that this process is in, has."""
+    """The bytes of memory of this machine, or of the container in which this process runs."""
     try:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):
@@ -21,12 +21,12 @@ def machine_memory() -> int:
 
 
 def operations_that_fit(bytes_each: int) -> int:
-    """The number of operations of this many bytes that fit into the `SHARE` of a scene."""
+    """The number of operations, of `bytes_each`, that fit into the fraction `SHARE` of the memory."""
     return int(SHARE * machine_memory() / bytes_each)
 
 
 def lack_of_memory(needed: float) -> str | None:
-    """The end of a sentence if `needed` bytes do not fit into the `SHARE` of a scene, else None."""
+    """The end of an error sentence if `needed` bytes exceed the fraction `SHARE` of the memory, else None."""
     there = machine_memory()
     if needed <= SHARE * there:
         return None

@@ -1,25 +1,25 @@
-"""The operations of scalar programs, one row each: everything that lagjax knows about `sin` stands in the row of `sin`.
+"""The operations of scalar programs, one row each: all that lagjax knows about `sin` is in the row of `sin`.
 
-    who asks                          what it reads of a row
+    reader                            fields of a row
     graph of a program                `value` on constants, `simplify`, `commutative`, `is_logical`
     evaluation in NumPy               `value`; `exact` and `transpose`, for round-off and the transposed derivative
     transposed program                `transpose`: `cotangents`, or else `slopes`
-    JAX again                         `lax`
+    conversion back to JAX            `lax`
     Taylor series                     `recurrence`, or else `slopes`; `is_step`
     machine code                      `llvm`
     text: C, formulas to read         `c`, `text`, `latex`
     check of a scene                  `side`
 
-The name of an operation is that of the JAX primitive it comes from, if there is one: an elementwise primitive with a
-row needs nothing else to be lowered. `_rules` lowers the primitives that compute with several operations.
+An operation has the name of the JAX primitive that it implements, if there is one: an elementwise primitive with a row
+needs no further lowering rule. `_rules` lowers the primitives that need several operations.
 
-Formulas about an operation are written once for all of these, in the terms of whoever evaluates them: `f(op, *xs)`
-applies an operation, `c(x)` makes a number, `w` is the result and `u`, `v` (or `y`, `x`) are the operands. A slope of
-`tan` is `f("add", c(1.0), f("mul", w, w))`: nodes of a graph in a Taylor series and in a transpose, arrays in NumPy.
+Formulas of an operation are written once for all readers: `f(op, *xs)` applies an operation, `c(x)` makes a constant,
+`w` is the result and `u`, `v` (or `y`, `x`) are the operands. The slope of `tan` is `f("add", c(1.0), f("mul", w, w))`:
+nodes of a graph in a Taylor series and in a transpose, arrays in NumPy.
 
 Two operations carry an attribute: `round` (1: ties to even, 0: away from zero) and `convert` (the kind of the result).
 `convert` has no code here because it depends on both kinds. Sine and cosine of one angle are computed together by
-`_native.series._lanes` and by `_emit`. What is looked up in a table is no elementwise operation: see `_look_ups`.
+`_native.series._lanes` and by `_emit`. A look-up in a table is not elementwise: see `_look_ups`.
 """
 
 import math
@@ -78,7 +78,7 @@ class Operation:
     latex: str | None = None
 
     def write_c(self, *operands: str, attribute=None) -> str:
-        """The expression in C, for operands that are names, numbers or stand in brackets."""
+        """The expression in C; the operands are names, numbers or bracketed expressions."""
         name = self.llvm if isinstance(self.llvm, str) else self.name
         form = self.c or self.text
         if form is None:
@@ -86,14 +86,14 @@ class Operation:
         return form.format(*operands, rounds="rint" if attribute == 1 else "round")
 
     def transpose(self) -> "tuple[Callable | None, ...]":
-        """`(f, c, g, w, *operands)` → the cotangent, for every operand; empty where it is constant in pieces."""
+        """For every operand `(f, c, g, w, *operands)` → its cotangent from g, that of w; empty for zero slopes."""
         if self.cotangents:
             return self.cotangents
         return tuple(lambda f, c, g, w, *xs, slope=slope: f("mul", g, slope(f, c, w, *xs)) for slope in self.slopes)
 
 
 def apply_in_numpy(op: str, *xs, attribute=None):
-    """The operation on numbers or arrays: `f` of the formulas below, in NumPy."""
+    """The operation on numbers or arrays: the function `f` of the formulas here, in NumPy."""
     return OPERATIONS[op].value(*xs) if attribute is None else OPERATIONS[op].value(*xs, attribute)
 
 
@@ -132,6 +132,13 @@ def _select(predicate, no, yes):
     return np.where(predicate, yes, no)[()]
 
 
+def _log_of_sum(code, a, b):
+    """log(eᵃ + eᵇ), in machine code."""
+    difference = a - b
+    result = code.maximum(a, b) + code.library("log1p", code.library("exp", -abs(difference)))
+    return code.select(code.compare("==", difference, difference), result, a + b)
+
+
 # ---- pieces of formulas ----------------------------------------------------------------------------------------------
 
 
@@ -168,7 +175,7 @@ def _radius_squared(f, y, x):
 
 
 def _whole_part(f, w, u, v):
-    """The whole number n of u = n v + w."""
+    """The whole number n in u = n v + w, as a node or array."""
     return f("round", f("div", f("sub", u, w), v), attribute=1)
 
 
@@ -185,22 +192,22 @@ def _choose_value(f, condition, yes, no):
 
 
 def _share(f, c, g, larger, smaller):
-    """The cotangent of the operand `larger` of a maximum: all of g where it is that, a half of it where both are."""
+    """The cotangent of operand `larger` of a maximum: g if it is the larger one, ½ g if both are equal, else 0."""
     whole = _choose_value(f, f("gt", larger, smaller), c(1.0), c(0.0))
     return f("mul", g, _choose_value(f, f("eq", larger, smaller), c(0.5), whole))
 
 
 def _power_by_base(f, c, g, w, u, v):
-    """The cotangent of the base of a power: zero where the exponent is zero, at a base of zero too.
+    """The cotangent of the base u of w = uᵛ: v uᵛ⁻¹ g, and 0 at u = v = 0.
 
-    It has a slope in the exponent there, so that no more is left out than 0 · ∞.
+    At u = v = 0 the derivative is 0 · ∞, and the power still has a slope in v.
     """
     undefined = f("and", f("eq", u, c(0.0)), f("eq", v, c(0.0)))
     return f("mul", g, _choose_value(f, undefined, c(0.0), f("mul", v, f("pow", u, f("sub", v, c(1.0))))))
 
 
 def _power_by_exponent(f, c, g, w, u, v):
-    """The cotangent of the exponent of a power: zero where the base is zero."""
+    """The cotangent of the exponent v of w = uᵛ: w log(u) g, and 0 at u = 0."""
     return f("mul", g, f("mul", w, f("log", _choose_value(f, f("eq", u, c(0.0)), c(1.0), u))))
 
 
@@ -233,7 +240,7 @@ def _intrinsic(name: str) -> Callable:
 
 
 def _smooth_map(name: str, value: Callable, slope: Callable, llvm: str | Callable | None = None, **rest) -> Operation:
-    """A smooth function of one number; in machine code that of the C library, where nothing else is said."""
+    """The row of a smooth function of one number; its machine code calls the C library unless `llvm` is given."""
     return Operation(name, 1, value, name if llvm is None else llvm, slopes=(slope,), **rest)
 
 
@@ -298,6 +305,14 @@ _ROWS = (
     _smooth_map("log1p", np.log1p, lambda f, c, w, u: _inverse(f, c, _one_plus(f, c, u))),
     _smooth_map("logistic", lambda x: 1 / (1 + np.exp(-x)), lambda f, c, w, u: f("sub", w, _square(f, w)),
               lambda code, a: 1.0 / (1.0 + code.library("exp", -a)), c="1.0 / (1.0 + exp(-{0}))"),
+    Operation(
+        "logaddexp", 2, np.logaddexp, _log_of_sum, commutative=True,
+        slopes=(
+            lambda f, c, w, u, v: f("logistic", f("sub", u, v)),
+            lambda f, c, w, u, v: f("logistic", f("sub", v, u)),
+        ),
+        latex=r"\log\left(e^{{{0}}} + e^{{{1}}}\right)",
+    ),
     _smooth_map("erf", np.vectorize(math.erf, otypes=[float]), lambda f, c, w, u: _gauss(f, c, u), simplify=_odd),
     _smooth_map("erfc", np.vectorize(math.erfc, otypes=[float]), lambda f, c, w, u: f("neg", _gauss(f, c, u))),
     # Circular functions
@@ -412,7 +427,7 @@ SLOW_FAR_OUT = frozenset(("log", "log1p", "asinh", "acosh", "sqrt", "cbrt"))
 
 
 def is_function(op: str) -> bool:
-    """True for an operation that is told by its slopes, and not by a recurrence of its own."""
+    """True for an operation w = f(u) whose Taylor series follows from its slopes, not from a recurrence of its own."""
     return bool(OPERATIONS[op].slopes) and OPERATIONS[op].recurrence is None
 
 
@@ -421,7 +436,7 @@ LOOK_UPS = {name: Operation(name, 1, _refuse_look_up, None, is_step=True, exact=
 
 
 class _OperationTable(dict):
-    """The elementwise operations by their names; look-ups are known, but are none of them."""
+    """The rows of the elementwise operations by name; indexing also finds look-ups, iteration leaves them out."""
 
     def __missing__(self, name: str) -> Operation:
         return LOOK_UPS[name]

@@ -1,4 +1,4 @@
-"""Last passes over a finished graph, when it is known how often every node is used."""
+"""Passes over a finished graph: they use how often every node is used."""
 
 import functools
 from collections import Counter
@@ -9,10 +9,10 @@ from lagjax._program._line import StraightLine
 
 
 def factor(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
-    """The graph with squares formed first in every product, and with the common factor of a sum drawn out of it.
+    """Rewrite products with squares first, x(x y) as x² y, and draw common factors out of sums, x y + x z as x (y + z).
 
-    Both happen only where the products that they replace have no other use, so that no operation is added: x(x y)
-    becomes x² y, and x y + x z becomes x (y + z). What has become equal by that is shared, sin² + cos² too.
+    Both are done only where the products replaced have no further use, so that no operation is added. Nodes that become
+    equal are shared, and sin² + cos² is simplified. Returns the new graph and the ids of the outputs in it.
     """
     uses = count_uses(graph.nodes, outputs)
 
@@ -30,9 +30,9 @@ def factor(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
 
 
 def _rewrite_graph(graph, outputs, uses, node_of: Callable, make: Callable) -> tuple[Graph, list[int]]:
-    """A graph with `node_of(new, i, moved)` in the place of every node i for which that is not None, and the outputs.
+    """Copy the used nodes to a new graph, node i as `node_of(new, i, moved)` or, where that is None, by `make`.
 
-    `moved(x)` says where a node before i is. The others are made anew by `make`, so that all is compared once more.
+    `moved(x)` is the id in the new graph of an earlier node x. Returns the new graph and the ids of the outputs.
     """
     new, places = Graph(graph.budget), {}
     new.budget += LONGEST_SUM * len(uses)  # what a pass writes anew and drops again is not what the budget is for
@@ -49,7 +49,7 @@ def _rewrite_graph(graph, outputs, uses, node_of: Callable, make: Callable) -> t
 
 
 def _product_factors(graph, uses, i) -> list[int]:
-    """The factors of a product, looking into products that have no other use, a few at most."""
+    """The factors of product i; those that are products without further use are split, up to `LONGEST_SUM`."""
     factors, k = list(graph.nodes[i][1]), 0
     while k < len(factors):
         op, operands, _ = graph.nodes[factors[k]]
@@ -61,7 +61,7 @@ def _product_factors(graph, uses, i) -> list[int]:
 
 
 def _multiply_squares_first(graph, factors) -> int | None:
-    """Their product, if one of them comes twice."""
+    """The node of the product of `factors` with squares formed first; None if no factor repeats."""
     counts = Counter(factors)
     if any(graph.value(x) is not None and n > 1 for x, n in counts.items()):  # constants that overflow, or underflow
         return None
@@ -91,7 +91,7 @@ def _common_factor(graph, op, a, b) -> int | None:
 
 
 def sink_negations(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
-    """The graph with every negation moved into the difference or the constant below it, if nothing else uses that."""
+    """Move every negation into its operand where nothing else uses that: −(a − b) is b − a, −(2 x) is (−2) x."""
     uses = count_uses(graph.nodes, outputs)
 
     def node_of(new, i, moved):
@@ -102,7 +102,7 @@ def sink_negations(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
 
 
 def _cheap_negative(graph, i) -> int | None:
-    """`-i` without an operation more than `i` itself, if there is such a thing."""
+    """The node of −i if it needs no further operation: a difference swapped, or a constant negated; else None."""
     op, operands, _ = graph.nodes[i]
     if op == "sub":
         return graph.node("sub", *operands[::-1])
@@ -115,7 +115,7 @@ def _cheap_negative(graph, i) -> int | None:
 
 
 def eliminate_dead_code(of: Graph | StraightLine, outputs: Sequence[int]) -> StraightLine:
-    """The nodes of a graph or a line that these depend on, renumbered, as a line with these outputs."""
+    """The straight line with the given outputs: only the nodes that they depend on, renumbered."""
     nodes, kept = of.nodes, find_ancestors(of.nodes, outputs)
     if len(kept) == len(nodes):
         return StraightLine(tuple(nodes), tuple(of.kinds), tuple(outputs))
@@ -133,7 +133,7 @@ def eliminate_dead_code(of: Graph | StraightLine, outputs: Sequence[int]) -> Str
 
 
 def count_uses(nodes: Sequence[Node], outputs: Sequence[int]) -> list[int]:
-    """The number of uses of each node, by nodes that are needed or as an output."""
+    """The number of uses of each node, as an operand of a used node or as an output."""
     uses = [0] * len(nodes)
     for i in outputs:
         uses[i] += 1

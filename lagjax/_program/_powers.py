@@ -32,14 +32,14 @@ _BETWEEN = {"sin": 1.0, "cos": 1.0, "tanh": 1.0, "erf": 1.0, "atan": math.pi / 2
 
 
 class Power(NamedTuple):
-    """A base, and the exponent that is largest in size among those of its powers of one sign."""
+    """A base, and the largest exponent in magnitude among its powers with that sign of the exponent."""
 
     base: int
     exponent: float
 
 
 def find_powers(line: StraightLine, nodes: Iterable[int], guards: set[int], size: int) -> list[Power]:
-    """The powers to watch among these nodes of a program of q, q̇, t and parameters; guards depend on some of them."""
+    """The powers among `nodes` whose change a Taylor series may miss; the program has `size` coordinates."""
     program, found = _ProductFactors(line, sorted(nodes), size), {}
     for i in program.users:
         for base, e in program.factors.get(i, {}).items():
@@ -49,9 +49,9 @@ def find_powers(line: StraightLine, nodes: Iterable[int], guards: set[int], size
 
 
 class _ProductFactors:
-    """The numbers of a program as products: what they are products of, of what moves; and what uses whole products.
+    """The nodes of a program as products of powers of moving bases (`factors`), and the nodes that use each product.
 
-    A number that moves and has no `factors` here is its own.
+    A moving node without an entry in `factors` is its own base.
     """
 
     def __init__(self, line: StraightLine, nodes: list[int], size: int):
@@ -81,7 +81,7 @@ class _ProductFactors:
                 self.holders.setdefault(base, []).append(i)
 
     def factors_of(self, i: int) -> dict[int, float]:
-        """The bases of a number, each with its exponent; none of one that does not move."""
+        """The exponents of node i by base; empty for a node that is constant along the motion."""
         return self.factors.get(i) or ({i: 1.0} if i in self._moving else {})
 
     def _multiply_factors(self, i: int, op: str, operands: tuple[int, ...]) -> dict[int, float]:
@@ -97,7 +97,7 @@ class _ProductFactors:
         return factors if 0 < len(factors) <= _LONGEST_PRODUCT else {i: 1.0}
 
     def is_hidden(self, base: int, i: int, of_guard: bool) -> bool:
-        """True if a negative power in product i may change by much along a step, without a trace at its beginning."""
+        """True if a negative power in product i may change much within a step, unseen in the series at its start."""
         exponent, squares = self.factors[i][base], self.squares(base)
         if not of_guard and len(squares) > 1 and -2 * exponent - self.degree(i, squares) <= _SLOWEST:
             return False
@@ -106,7 +106,7 @@ class _ProductFactors:
         return not (least > 0 and math.log(most / least) * -exponent < _SEEN)
 
     def _find_squares(self, i: int) -> set[int]:
-        """The numbers whose squares a sum consists of, but for what does not move; none of another sum."""
+        """The bases of a sum of squares, up to constant terms; empty for any other sum."""
         squares, terms = set(), [i]
         while terms:
             op, operands, _ = self.line.nodes[terms.pop()]
@@ -121,7 +121,7 @@ class _ProductFactors:
         return squares
 
     def degree(self, i: int, numbers: set[int], left: int = _DEEPEST_SUM) -> float:
-        """The degree in some numbers of what product i is multiplied with, itself included, where that is least."""
+        """The degree in `numbers` of the terms that contain product i as a factor, including i: the least of them."""
         own = sum(self.factors_of(i).get(x, 0.0) for x in numbers)
         sums = [u for u in self.users[i] if self.line.nodes[u][0] in ("add", "sub")]
         if own or not left or len(sums) < len(self.users[i]) or i in self.line.outputs:
@@ -130,7 +130,7 @@ class _ProductFactors:
         return min((self.degree(x, numbers, left - 1) for x in holders), default=0.0)
 
     def bounds(self, i: int) -> tuple[float, float]:
-        """Bounds of a number, where it is made of sums and products of bounded functions."""
+        """Lower and upper bound of node i by interval arithmetic on sums and products of bounded functions."""
         known, stack = self._bounds, [i]
         while stack:
             op, operands, value = self.line.nodes[stack[-1]]

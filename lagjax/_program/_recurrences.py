@@ -1,9 +1,8 @@
-"""The order recursion of the operations that have one of their own: arithmetic, roots and what is made of pieces.
+"""The order recursion of operations that are not w = f(u) by its slopes: arithmetic, roots, piecewise operations.
 
 A rule takes the recurrences under construction (`_series._Recurrences`), the id of the result in the program, the ids
 of the operands, and their Taylor coefficients of order k: nodes of the order recursion, None for an operand that is
-constant along the motion, though never for all of them. It returns the coefficient of order k of the result. Every
-other operation is w = f(u) and follows from its slopes.
+constant along the motion (not all operands are). It returns the coefficient of order k of the result.
 """
 
 import math
@@ -17,7 +16,7 @@ LARGEST_WHOLE = 2**_BITS  # beyond which a power is watched by its logarithm, wh
 
 
 def add(r, i, operands, of):
-    """wₖ = uₖ ± vₖ."""
+    """Sum or difference: wₖ = uₖ ± vₖ."""
     op, (a, b) = r.zeroth_order.nodes[i][0], of
     if b is None:
         return a
@@ -27,7 +26,7 @@ def add(r, i, operands, of):
 
 
 def multiply(r, i, operands, of):
-    """wₖ = u₀ vₖ + uₖ v₀ + Σ' uⱼ vₖ₋ⱼ."""
+    """Product: wₖ = u₀ vₖ + uₖ v₀ + Σ' uⱼ vₖ₋ⱼ."""
     (u, v), (a, b), apply = operands, of, r.order_recursion.apply
     if a is None:
         return apply("mul", r.value(u), b)
@@ -41,7 +40,7 @@ def multiply(r, i, operands, of):
 
 
 def divide(r, i, operands, of):
-    """wₖ = (uₖ − w₀ vₖ − Σ' wⱼ vₖ₋ⱼ) / v₀."""
+    """Quotient: wₖ = (uₖ − w₀ vₖ − Σ' wⱼ vₖ₋ⱼ) / v₀."""
     (_, v), (a, b), apply = operands, of, r.order_recursion.apply
     inverse, w = r.zeroth_order.apply("div", r.number(1.0), v), i
     if i in r.steep:  # of which a number that is read but not taken has derivatives, too
@@ -54,16 +53,16 @@ def divide(r, i, operands, of):
 
 
 def square_root(r, i, operands, of):
-    """wₖ = (uₖ − Σ' wⱼ wₖ₋ⱼ) / 2 w₀."""
+    """Square root: wₖ = (uₖ − Σ' wⱼ wₖ₋ⱼ) / 2 w₀."""
     half_inverse = r.value(finite(r.zeroth_order.apply, r.number, r.zeroth_order.apply("div", r.number(0.5), i)))
     return r.order_recursion.apply("mul", r.order_recursion.apply("sub", of[0], r.cauchy_product(i, i)), half_inverse)
 
 
 def raise_to_power(r, i, operands, of):
-    """wₖ of w = uᵛ by its slopes, or of the product uⁿ where v is a whole number n below 16, which has them at u = 0.
+    """Power w = uᵛ: wₖ by its slopes, or, for whole v = n < 16, as that of the product uⁿ, which is finite at u = 0.
 
-    An exponent that is a number of the member is told at order zero. The product is multiplied with exp((v − n) log u),
-    which is 1 and varies with v; not where a step begins so near u = 0 that uⁿ log u has no series to speak of.
+    An exponent that is an input is tested at order zero. The product is multiplied by exp((v − n) log u) = 1, which
+    gives it a derivative by v, except where a step starts so near u = 0 that uⁿ log u has no usable series.
     """
     (u, v), (_, moves) = operands, of
     slow = r.apply_slopes(i, operands, of)
@@ -87,15 +86,15 @@ def raise_to_power(r, i, operands, of):
 
 
 def finite(f, c, slope):
-    """0 for a slope that is infinite, or 0/0, where the function itself is not: there is no series there.
+    """The slope, but 0 where it is infinite or 0/0 while the function is finite, because no series exists there.
 
-    It may not be needed, as on the flat side of max(q, 0)**1.5; where it is, the step fails its check.
+    The zero is harmless on the flat side of max(q, 0)**1.5; where the slope is needed, the step fails its error check.
     """
     return f("select", f("is_finite", slope), c(0.0), slope)
 
 
 def remainder(r, i, operands, of):
-    """wₖ = uₖ − n vₖ, with the whole number n that is right at order zero."""
+    """Remainder w = u − n v: wₖ = uₖ − n vₖ, with the whole number n of order zero."""
     (u, v), (a, b), f = operands, of, r.zeroth_order.apply
     if b is None:
         return a
@@ -104,7 +103,7 @@ def remainder(r, i, operands, of):
 
 
 def select(r, i, operands, of):
-    """The coefficient of the branch that is taken at order zero."""
+    """Selection: the coefficient of the branch taken at order zero."""
     predicate, no, yes = operands
     for branch, other in ((no, yes), (yes, no)):
         number = r.zeroth_order.value(other)
@@ -115,20 +114,20 @@ def select(r, i, operands, of):
 
 
 def choose(r, predicate: int, no: int, yes: int) -> int:
-    """`yes` where the predicate, a node of the program, holds at order zero, else `no`."""
+    """The node of `yes` where the predicate, a node of the program, is true at order zero, else of `no`."""
     flag = r.zeroth_order.apply("select", predicate, r.number(0.0), r.number(1.0))
     holds = r.order_recursion.apply("gt", r.value(flag), r.order_recursion.number(0.5))
     return r.order_recursion.apply("select", holds, no, yes)
 
 
 def absolute(r, i, operands, of):
-    """wₖ = ±uₖ, with the sign of u₀."""
+    """Absolute value: wₖ = ±uₖ, with the sign of u₀."""
     below = r.zeroth_order.apply("lt", operands[0], r.number(0.0))
     return choose(r, below, of[0], r.order_recursion.apply("neg", of[0]))
 
 
 def extremum(comparison: str) -> Callable:
-    """The coefficient of the operand that is larger (`gt`) or smaller (`lt`) at order zero."""
+    """Rule of max (`comparison` "gt") or min ("lt"): the coefficient of the extreme operand at order zero."""
 
     def rule(r, i, operands, of):
         zero = r.order_recursion.number(0.0)

@@ -1,7 +1,7 @@
-"""The rounding errors of a straight line, as nodes of a graph: running errors, to first order.
+"""Running error bounds of a straight line, to first order, as nodes of a graph.
 
-Every operation adds one unit in the last place of its result to what its operands bring along, so that terms that
-cancel leave theirs behind. Source: Higham, *Accuracy and Stability of Numerical Algorithms*, §3.3.
+The error of a result is one rounding of the result, plus the errors of the operands times the slopes, so that terms
+that cancel leave their errors. Source: Higham, *Accuracy and Stability of Numerical Algorithms*, §3.3.
 """
 
 from collections.abc import Sequence
@@ -12,10 +12,10 @@ from lagjax._program._operations import OPERATIONS
 
 
 def rounding(graph: Graph, line: StraightLine, nodes: Sequence[int], moving: int, to_zero: bool = False) -> list[int]:
-    """The errors of the outputs of a line in units of round-off, where its first `moving` inputs are rounded, too.
+    """Error bounds of the outputs of a line, in units of round-off; its first `moving` inputs are rounded too.
 
-    `nodes` are those of the line in the graph, to which the errors are added. What is exact leaves no error behind a
-    slope that is infinite either, where that is said (`to_zero`).
+    `nodes` are the nodes of the line in the graph, to which the error nodes are added. With `to_zero`, an operand
+    without error contributes none even where the slope is infinite.
     """
     zero, errors = graph.number(0.0), []
     for (op, operands, attribute), kind, node in zip(line.nodes, line.kinds, nodes, strict=True):
@@ -32,7 +32,7 @@ def rounding(graph: Graph, line: StraightLine, nodes: Sequence[int], moving: int
 def operation_error(
     graph: Graph, op: str, node: int, operands: Sequence[int], errors: Sequence[int], to_zero: bool = False
 ) -> int:
-    """The error of an operation, which is a node of a graph, from those of its operands (see `rounding`)."""
+    """The error node of one operation `node` from the error nodes of its operands (see `rounding`)."""
     zero = graph.number(0.0)
     error = zero if OPERATIONS[op].exact else graph.apply("abs", node)
     for brought, rule in zip(errors, OPERATIONS[op].transpose(), strict=False):

@@ -41,10 +41,10 @@ _LARGEST_SERIES = 100  # operations that the series of one may take: a bound for
 
 
 class LinearSystem(NamedTuple):
-    """A z = r, of which the outputs of a program are the solution: nodes of that program.
+    """The linear system A z = r whose solution z are the outputs of a program; all ids are nodes of that program.
 
-    `entries` holds those of the symmetric A on and below its diagonal, by row and column; `others` entries that are not
-    symmetric. `solve()` is the straight line that takes the factors and then r, and gives z.
+    `entries` are those of the symmetric A on and below the diagonal, by (row, column); `others` are entries without a
+    symmetric partner. `solve()` makes the straight line from the factors of A, followed by r, to z.
     """
 
     z: tuple[int, ...]
@@ -56,12 +56,12 @@ class LinearSystem(NamedTuple):
 
     @property
     def read(self) -> list[int]:
-        """The nodes that A and r consist of."""
+        """The nodes of all entries of r and A."""
         return [*self.right, *self.entries.values(), *self.others.values()]
 
 
 class Recurrent(Protocol):
-    """The part of a program that Taylor series and machine code read: `Program` without JAX."""
+    """The part of a `Program` that Taylor series and machine code read, without its JAX part."""
 
     @property
     def line(self) -> StraightLine: ...
@@ -74,13 +74,13 @@ class Recurrent(Protocol):
 
 
 class Series(NamedTuple):
-    """The recurrences of the first `size` outputs of a program, along a motion of its first inputs.
+    """The Taylor recurrences of the first `size` outputs of a program, along a motion of its first inputs.
 
-    `zeroth_order` takes the inputs of the program and gives all its outputs, and `values` numbers more.
-    `order_recursion` takes the coefficients of order k of the moving inputs, then k and 1/k, these values, and one sum
-    Σ' aⱼ bₖ₋ⱼ for each pair of rows (a, b) in `cauchy_products`; it gives the coefficients of order k of the outputs,
-    and of each of the `rows` that the Cauchy products are made of. The last of `values` and of `rows` are those of the
-    `followed` nodes of the program.
+    `zeroth_order` maps the inputs to all outputs and to `values` further numbers. `order_recursion` takes the
+    coefficients of order k of the moving inputs, then k and 1/k, these values, and one sum Σ' aⱼ bₖ₋ⱼ for each pair of
+    rows (a, b) in `cauchy_products`; it gives the coefficients of order k of the outputs, and of each of the `rows`
+    that occur in Cauchy products. The last `followed` of the values and of the rows belong to the nodes whose series
+    the caller asked for.
     """
 
     size: int
@@ -93,11 +93,11 @@ class Series(NamedTuple):
 
 
 def series(program: Recurrent, size: int, moving: int, followed: Sequence[int] = ()) -> Series:
-    """The recurrences of the first `size` outputs; all inputs but the first `moving` are constant along the motion.
+    """Derive the recurrences of the first `size` outputs; all inputs after the first `moving` are constant in time.
 
-    For ẏ = f(t, y) with m components these are m outputs and m + 1 inputs (y and t, in any order); for q̈(q, q̇, t)
-    with n coordinates, n and 2n + 1. The nodes `followed` of the program get their series too. Raises `Unlowerable` for
-    an operation whose series is not known here.
+    For ẏ = f(t, y) with m components, size is m and moving is m + 1 (y and t, in any order); for q̈(q, q̇, t) with n
+    coordinates, n and 2n + 1. The nodes `followed` of the program get series too. Raises `Unlowerable` for an operation
+    without a known series.
     """
     with np.errstate(all="ignore"):  # a constant may be 1/0, where the mass matrix is singular: that is found later
         outputs = list(program.line.outputs)
@@ -105,7 +105,7 @@ def series(program: Recurrent, size: int, moving: int, followed: Sequence[int] =
 
 
 class _Recurrences:
-    """Two growing graphs: the program with derivatives g, and what is linear in the coefficients of order k."""
+    """Two graphs under construction: the program with the derivatives it needs, and the recursion linear in order k."""
 
     def __init__(self, program: Recurrent, size: int, moving: int, followed: Sequence[int]):
         self.moving = moving
@@ -122,13 +122,13 @@ class _Recurrences:
         # Of an elimination no coefficient is needed: it is most of a large program.
         linear = program.linear
         self._find_coefficients((linear and linear.read) or list(program.line.outputs[:size]))
-        self._find_added(len(program.line.nodes))
+        self._find_added_coefficients(len(program.line.nodes))
         self.solution = [] if program.linear is None else self._solution_coefficients(program.linear)
         if program.linear is not None:  # what is followed may depend on it
             self._coefficients = dict(zip(program.linear.z, self.solution, strict=True)) | self._coefficients
         added = len(self.zeroth_order.nodes)
         self._find_coefficients(list(followed))
-        self._find_added(added)
+        self._find_added_coefficients(added)
         done = 0
         while done < len(self._rows):  # a derivative may be a number that nothing else needed
             new, done = list(self._rows)[done:], len(self._rows)
@@ -136,8 +136,8 @@ class _Recurrences:
                 if not isinstance(of, _SolutionComponent):
                     self.coefficient(of)
 
-    def _find_added(self, first: int) -> None:
-        """The coefficients of the nodes from `first` on: the rules add derivatives at the end."""
+    def _find_added_coefficients(self, first: int) -> None:
+        """Find the coefficients of all nodes from id `first` on: derivatives are appended while rules run."""
         while first < len(self.zeroth_order.nodes):
             self.coefficient(first)
             first += 1
@@ -153,7 +153,7 @@ class _Recurrences:
         return self._input_node("value", node)
 
     def cauchy_product(self, a: int, b: "int | _SolutionComponent", by_order: bool = False) -> int:
-        """Σ' aⱼ bₖ₋ⱼ, or Σ' j aⱼ bₖ₋ⱼ."""
+        """The input node of the sum Σ' aⱼ bₖ₋ⱼ, or with `by_order` of Σ' j aⱼ bₖ₋ⱼ."""
         first, second = self._coefficient_row(a, by_order), self._coefficient_row(b, False)
         return self._input_node("product", min(first, second), max(first, second))
 
@@ -173,7 +173,7 @@ class _Recurrences:
         return self._coefficients[i]
 
     def _find_coefficients(self, roots: list[int]) -> None:
-        """The coefficients of these nodes, and before them those of what they depend on."""
+        """Find the coefficients of order k of the nodes `roots` and of all nodes they depend on, operands first."""
         missing, stack = set(), list(roots)
         while stack:
             i = stack.pop()
@@ -204,7 +204,7 @@ class _Recurrences:
         return self.apply_slopes(i, operands, of) if OPERATIONS[op].slopes else _UnknownSeries(op)
 
     def apply_slopes(self, i, operands, of):
-        """w = f(u, …) by its partial derivatives."""
+        """The coefficient of w = f(u, …) from its partial derivatives: Σ over operands of uₖ g₀ + 1/k Σ' j uⱼ gₖ₋ⱼ."""
         row = OPERATIONS[self.zeroth_order.nodes[i][0]]
         total, apply = None, self.order_recursion.apply
         for u, c, slope in zip(operands, of, row.slopes, strict=True):
@@ -228,7 +228,7 @@ class _Recurrences:
     # ---- a linear system: the coefficients of its solution, without those of its elimination ----
 
     def _solution_coefficients(self, system) -> list[int]:
-        """The coefficients zₖ where A z = r: A₀ zₖ = rₖ − Aₖ z₀ − Σ' Aⱼ zₖ₋ⱼ, solved with the factors of A₀."""
+        """The coefficients zₖ of the solution of A z = r: A₀ zₖ = rₖ − Aₖ z₀ − Σ' Aⱼ zₖ₋ⱼ, with the factors of A₀."""
         apply = self.order_recursion.apply
         residual = [self._output_coefficient(node) for node in system.right]
         entries = [(dict.fromkeys([(i, j), (j, i)]), node) for (i, j), node in system.entries.items()]
@@ -242,7 +242,7 @@ class _Recurrences:
         return self._inline_line(system.solve(), system.factors, residual)
 
     def _inline_line(self, line: StraightLine, factors, right: list[int]) -> list[int]:
-        """The outputs of a line of factors (order zero) and a right-hand side (order k), as recursion nodes."""
+        """The outputs of a line copied into the recursion; inputs: `factors` (order zero), `right` (order k)."""
         places: list[tuple[bool, int]] = []  # whether of the zeroth order, and which node
 
         def recursion_node(place):
@@ -267,7 +267,7 @@ class _Recurrences:
     # ---- the end: only what the outputs need ----
 
     def finish(self, outputs: list[int], size: int, followed_nodes: list[int]) -> Series:
-        """Both graphs, without the products and values that nothing needs."""
+        """The two straight lines, with only those Cauchy products, rows and values that the outputs depend on."""
         rates = self.solution[:size] or [self._output_coefficient(i) for i in outputs[:size]]
         followed = [self._output_coefficient(i) for i in followed_nodes]
         rows = list(self._rows)
@@ -313,12 +313,12 @@ class _Recurrences:
 
 
 class _SolutionComponent(NamedTuple):
-    """Component i of the solution of the linear system, as the owner of a row."""
+    """Component i of the solution z of the linear system: the key of a coefficient row."""
 
     i: int
 
 
 class _UnknownSeries(NamedTuple):
-    """No series: which operation is to blame."""
+    """Mark of a node without a Taylor series: the operation `op` has none."""
 
     op: str

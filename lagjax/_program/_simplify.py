@@ -1,8 +1,8 @@
-"""Algebra on the nodes of a graph: one rule for every operation that has a simpler form for some operands.
+"""Algebraic simplification: one rule for every operation that has a simpler form for some operands.
 
-A rule takes the graph, the name of the operation and the ids of its operands, of which not all are constants, and
-returns the id of the simplest node with that value. It asks the graph for the nodes it needs: `Graph.apply` where those
-may become simpler in turn, `Graph.node` where they are final.
+A rule takes the graph, the name of the operation and the ids of its operands, not all of them constant, and returns the
+id of the simplest node with the same value. It builds nodes by `Graph.apply` where they may simplify further, and by
+`Graph.node` where they are final.
 """
 
 import math
@@ -11,7 +11,7 @@ import numpy as np
 
 
 def add(graph, op, a, b):
-    """x + 0 is x; like terms are collected; and two selections of which one is zero: the derivative of `where`."""
+    """x + 0 is x; like terms are collected; `select(p, 0, x) + select(p, y, 0)` is one selection."""
     if graph.value(a) == 0:
         return b
     if graph.value(b) == 0:
@@ -42,7 +42,7 @@ def negate(graph, op, a):
 
 
 def multiply(graph, op, a, b):
-    """0 x is 0, 1 x is x; constants multiply out, signs move outside, equal products are one."""
+    """0 x is 0, 1 x is x; constants are multiplied, signs become outer negations, equal products are one node."""
     if graph.value(a) == 0 or graph.value(b) == 0:
         return graph.constant(0, graph.kinds[a])
     if graph.kinds[a] != "float":
@@ -68,12 +68,12 @@ def multiply(graph, op, a, b):
 
 
 def _is_in_range(m: float, n: float) -> bool:
-    """True where the product of two constants neither overflows nor underflows: what they multiply may not, either."""
+    """True where the product m n of constants is far from overflow and underflow, so that combining them is safe."""
     return not (m and n) or 1e-290 < abs(m * n) < math.inf or abs(n) == 1
 
 
 def divide(graph, op, a, b):
-    """0 / x is 0; division by a power of two is a product; signs move outside; (x / √u) / √u is x / u."""
+    """0 / x is 0; division by a power of two is a product; signs become outer negations; (x / √u) / √u is x / u."""
     if graph.value(a) == 0:
         return a
     divisor = graph.value(b)
@@ -91,7 +91,7 @@ def divide(graph, op, a, b):
 
 
 def direction(graph, a, b):
-    """x / |x|, or a multiple of it, as the sign of x, which has both sides at zero; None of other quotients."""
+    """The node of x / |x|, or of a multiple, as the sign of x, which is defined at zero; None for other quotients."""
     (m, x), (n, size) = graph.term(a), graph.term(b)
     if (of := graph.operand_of("abs", size)) is None:
         return None
@@ -100,7 +100,7 @@ def direction(graph, a, b):
 
 
 def root(graph, op, a):
-    """√(x²) is |x|, which has two smooth sides; and 1/√(x²) is 1/|x|."""
+    """√(x²) is |x|, which is smooth on either side of zero; and 1/√(x²) is 1/|x|."""
     of, operands, _ = graph.nodes[a]
     if of != "mul" or operands[0] != operands[1]:
         return graph.node(op, a)
@@ -109,7 +109,7 @@ def root(graph, op, a):
 
 
 def raise_to_power(graph, op, a, b):
-    """Whole and half exponents up to 16 become products and a root: more exact, and many times as fast as `pow`."""
+    """Whole and half exponents up to 16 become products and a root: more exact than `pow`, and many times faster."""
     exponent = graph.value(b)
     if exponent is None or abs(exponent) > 16 or (2 * exponent) % 1:
         return graph.node("pow", a, b)
@@ -118,21 +118,21 @@ def raise_to_power(graph, op, a, b):
         result = graph.apply("mul", result, graph.apply("sqrt", a))
     if exponent < 0:
         result = graph.apply("div", graph.constant(1, "float"), result)
-    return _note_power(graph, a, exponent, result)
+    return _record_power(graph, a, exponent, result)
 
 
 def whole_power(graph, a: int, exponent: int) -> int:
-    """The node `a**exponent` for a whole exponent of any sign."""
+    """The node of `a**exponent` for a whole exponent of any sign."""
     result = _positive_power(graph, a, abs(exponent))
     if exponent < 0:
         result = graph.apply("div", graph.constant(1.0, graph.kinds[a]), result)
-    return _note_power(graph, a, exponent, result)
+    return _record_power(graph, a, exponent, result)
 
 
-def _note_power(graph, a: int, exponent: float, result: int) -> int:
-    """The node of a power, kept in mind as one: its derivative is not that of the products that it consists of.
+def _record_power(graph, a: int, exponent: float, result: int) -> int:
+    """Record that node `result` is `a**exponent`, to be differentiated as a power, not as a product; return it.
 
-    An earlier node, which was written as another product, is not a power of a later one: derivatives go in order.
+    Nothing is recorded if the node is older than `a`: differentiation goes through the nodes in their order.
     """
     if a < result and exponent not in (0, 0.5, 1) and graph.kinds[a] == "float" and graph.value(result) is None:
         graph.powers.setdefault(result, (a, exponent))
@@ -140,7 +140,7 @@ def _note_power(graph, a: int, exponent: float, result: int) -> int:
 
 
 def _positive_power(graph, a: int, exponent: int) -> int:
-    """`a**exponent` for a whole `exponent >= 0`, by repeated squaring: other powers of `a` share the squares."""
+    """The node of `a**exponent` for a whole exponent ≥ 0, by repeated squaring, so that powers of `a` share squares."""
     result = graph.constant(1, graph.kinds[a])
     while exponent:
         if exponent & 1:
@@ -152,19 +152,19 @@ def _positive_power(graph, a: int, exponent: int) -> int:
 
 
 def odd(graph, op, a):
-    """f(−x) is −f(x)."""
+    """Simplify an odd function: f(−x) is −f(x)."""
     positive = graph.operand_of("neg", a)
     return graph.node(op, a) if positive is None else negate(graph, "neg", graph.node(op, positive))
 
 
 def even(graph, op, a):
-    """f(−x) is f(x)."""
+    """Simplify an even function: f(−x) is f(x)."""
     positive = graph.operand_of("neg", a)
     return graph.node(op, a if positive is None else positive)
 
 
 def extremum(graph, op, a, b):
-    """max(x, x) is x; of bools the larger one is `or`."""
+    """max(x, x) is x; of bools, max is `or` and min is `and`."""
     if graph.kinds[a] == "bool":
         return graph.apply("or" if op == "max" else "and", a, b)
     return a if a == b else graph.node(op, a, b)
@@ -187,10 +187,10 @@ def invert(graph, op, a):
 
 
 def select(graph, op, predicate, no, yes):
-    """One branch where the predicate is known or both branches are the same; the predicate where that is the result.
+    """The taken branch of a known predicate; the only branch of two equal ones; the predicate if it is the result.
 
-    Of a branch that is a selection by the same predicate, it is one branch of that.
-    `where(x == 0, 0, x)` is x: a series that begins at zero would be that of zero for good.
+    A branch that is itself a selection by the same predicate is replaced by its branch. `where(x == 0, 0, x)` is x: the
+    series of the constant branch would be that of zero.
     """
     known = graph.value(predicate)
     if known is not None or no == yes:
@@ -234,7 +234,7 @@ _NEVER_NEGATIVE = frozenset(("exp", "exp2", "cosh", "logistic", "erfc", "sqrt", 
 
 
 def is_nonnegative(graph, i: int, depth: int = _DEEPEST) -> bool:
-    """True if the form of a number tells that it is not negative."""
+    """True if node i is nonnegative by its form: a square, exp, |x|, sums and products of these, …"""
     op, operands, attribute = graph.nodes[i]
     if op == "constant" or not depth:
         return op == "constant" and attribute >= 0
@@ -250,7 +250,7 @@ _BY_OPERANDS = frozenset(("add", "mul", "div", "max", "min", "select", "integer_
 
 
 def angle(graph, op, y, x):
-    """atan2(sin u, cos u) is u less whole turns."""
+    """atan2(c sin u, c cos u) is u reduced to (−π, π]."""
     (m, sine), (n, cosine) = graph.term(y), graph.term(x)
     u, v = graph.operand_of("sin", sine), graph.operand_of("cos", cosine)
     if u is None or u != v or abs(m) != n:
@@ -259,7 +259,7 @@ def angle(graph, op, y, x):
 
 
 def arctangent(graph, u: int) -> int:
-    """atan(u). Where u is y/x, and x may change its sign, this is atan2(±y, ±x): it jumps at x = 0, and is no pole."""
+    """The node of atan(u). For u = y/x with x of varying sign: atan2(±y, ±x), which jumps at x = 0 without a pole."""
     f, zero, one = graph.apply, graph.constant(0.0, "float"), graph.constant(1.0, "float")
     if (angle := graph.operand_of("tan", u)) is not None:
         return _period_remainder(graph, angle, math.pi)
@@ -273,7 +273,7 @@ def arctangent(graph, u: int) -> int:
 
 
 def inverse(graph, x: int, op: str) -> int:
-    """arccos(cos u) is |u| less whole turns, arcsin(sin u) is ±u less half ones; the sum of both functions is π/2."""
+    """arccos or arcsin (`op`) of x: for cos u and sin u, |u| or ±u reduced by whole turns; else by arctangents."""
     of, operands, _ = graph.nodes[x]
     if of == "neg" and graph.nodes[operands[0]][0] in ("sin", "cos"):
         found = inverse(graph, operands[0], op)
@@ -296,14 +296,14 @@ def inverse(graph, x: int, op: str) -> int:
 
 
 def _period_remainder(graph, u: int, period: float) -> int:
-    """u less whole periods, from −½ period to ½."""
+    """The node of u minus the nearest multiple of `period`: from −½ period to ½ period."""
     return graph.apply("sub", u, graph.scale(period, _count_periods(graph, u, period)))
 
 
 def _count_periods(graph, u: int, period: float) -> int:
-    """The number of whole periods in u + ½ period, 0 for u = ±½ period as rounded: u is reduced by 2⁻⁵¹ of itself.
+    """The whole number nearest to u / period; u is scaled by 1 − 2⁻⁵¹ so that ±½ period, as rounded, counts as 0.
 
-    NaN beyond `_MOST_WHOLE_TURNS`, where u does not determine the remainder.
+    NaN beyond `_MOST_WHOLE_TURNS`, where the digits of u do not determine the remainder.
     """
     f, number = graph.apply, lambda x: graph.constant(x, "float")
     wholes = f("floor", f("add", f("mul", number((1 - 2.0**-51) / period), u), number(0.5)))
@@ -311,7 +311,7 @@ def _count_periods(graph, u: int, period: float) -> int:
 
 
 def _split_quotient(graph, i: int, depth: int) -> tuple[int, int | None]:
-    """Numerator and denominator of a number with poles where the denominator changes its sign; else itself and None."""
+    """Numerator and denominator of node i if it has poles where the denominator changes its sign; else i, None."""
     op, operands, exponent = graph.nodes[i]
     f, one = graph.apply, graph.constant(1.0, "float")
     if op == "tan":

@@ -1,14 +1,14 @@
-"""Motion along borders that both sides push onto: the program with the shares of both sides as further unknowns.
+"""Motion along borders onto which both sides push (Filippov's sliding mode): their shares are further unknowns.
 
-On a border u = 0 the acceleration is a share α of that on the upper side, and 1 − α of that on the lower one, with α
+On a border u = 0 the acceleration is a share α of that on the upper side plus 1 − α of that on the lower one, with α
 such that u stays zero (Filippov, *Differential Equations with Discontinuous Righthand Sides*, 1988, ch. 2, §4). Where u
-depends on velocities, u̇ is to be zero; where it depends on positions alone, ü. Several borders at once have their
-shares together, from one linear system.
+depends on velocities, u̇ = 0 is required; where it depends on positions alone, ü = 0. The shares of several borders
+solve one linear system.
 
-Where pieces act on the right side alone of A z = r, each for itself (`_border_forces`), they are unknowns of that
-system: the piece p + μ instead of p, with A z − Σ μₖ ∂r/∂pₖ = r, and one row more for each, that of u̇ = 0, or μ = 0
-where nothing slides. Its series needs no series of an elimination. Else, for a few pieces at most, that system is that
-of q̈ itself, z = q̈. What such equations leave is rounding, which `_held` takes away.
+If pieces act only on the right side of A z = r, independently (`_border_forces`), they become unknowns of that system:
+the piece p + μ in place of p, with A z − Σ μₖ ∂r/∂pₖ = r, and one more row for each, u̇ = 0, or μ = 0 where nothing
+slides. Then no series of an elimination is needed. Otherwise, for few pieces, the system is z = q̈ itself. `_held`
+removes the rounding error that these equations leave.
 """
 
 import functools
@@ -20,7 +20,7 @@ import numpy as np
 from lagjax._program._border_forces import LARGEST_SLIDING, Slide, SlidingRows
 from lagjax._program._differentiation import copy_nodes, copy_operation
 from lagjax._program._graph import Graph, find_descendants, find_readers
-from lagjax._program._held import Coupled, Held, choose_pivots
+from lagjax._program._held import BorderEquations, HeldMotion, choose_pivots
 from lagjax._program._levels import FAR
 from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._series import LinearSystem, StraightLine
@@ -46,13 +46,13 @@ STILL = 1e-9
 
 
 class Holding(NamedTuple):
-    """The means to keep a motion on the borders that it slides along.
+    """The means to keep a motion on the borders along which it slides.
 
-    `retraction` takes the inputs of the program to the state (q, q̇) on them, None where the motion may slide along
-    none; `moved` are the coordinates that the force of each moves; borders of different `groups` do not act on each
-    other at one instant. `release` gives for each cone two changes of q̇ (n,): one makes its vector a unit vector along
-    what it does not hold, one makes it zero. `unheld` counts the borders along which the motion may slide without being
-    followed.
+    `retraction` maps the inputs of the program to the state (q, q̇) on the borders; None if the motion cannot slide.
+    `moved` are the coordinates that the force of each border moves; borders of different `groups` do not interact at an
+    instant. `release` gives for each cone two changes of q̇ (n,): the first makes its vector a unit vector in the
+    direction of the remaining force, the second makes it zero. `unheld` counts the borders along which sliding is
+    possible but not computed.
     """
 
     retraction: StraightLine | None = None
@@ -63,7 +63,7 @@ class Holding(NamedTuple):
 
 
 class Sliding(NamedTuple):
-    """A program with shares; `places` says where the nodes of the one without them are."""
+    """A program with shares as further switching numbers; `places` maps the nodes of the program without them."""
 
     line: StraightLine
     places: Sequence[int]
@@ -75,9 +75,9 @@ class Sliding(NamedTuple):
 def with_sliding(
     line: StraightLine, n: int, first: int, switches: Sequence[int], slides: Sequence[Slide], linear: Any
 ) -> Sliding | None:
-    """The program whose motion slides along the borders `slides` where flags, its last inputs, are 1.
+    """The program whose motion slides along the borders `slides` where its last inputs, flags, are 1; None if too long.
 
-    `first` is the input of the first piece, `switches` are the nodes of the switching numbers. None if it is too long.
+    `first` is the position of the first piece among the inputs, `switches` are the nodes of the switching numbers.
     """
     if not slides:
         return Sliding(line, range(len(line.nodes)), [], linear, Holding())
@@ -86,12 +86,12 @@ def with_sliding(
     is_large = len(slides) > MOST_COPIES or len(line.nodes) > LARGEST_COPIED
     if is_large or any(slide.order > 1 or slide.parts for slide in slides):
         return None
-    done = _build_sliding(line, n, first, switches, slides, _solved_system(line.outputs[:n]))
+    done = _build_sliding(line, n, first, switches, slides, _identity_system(line.outputs[:n]))
     return done and done._replace(linear=None)
 
 
-def _solved_system(z: Sequence[int]) -> LinearSystem:
-    """The linear system 1 z = z, for pieces that act on more than the right side of the scene's own system."""
+def _identity_system(z: Sequence[int]) -> LinearSystem:
+    """The linear system 1 z = z, for pieces that act on more than the right side of the scene's system."""
     inputs = tuple(("input", (), i) for i in range(len(z)))
     same = StraightLine(inputs, ("float",) * len(z), tuple(range(len(z))))
     return LinearSystem(tuple(z), {}, tuple(z), (), lambda: same)
@@ -100,17 +100,17 @@ def _solved_system(z: Sequence[int]) -> LinearSystem:
 def _build_sliding(
     line: StraightLine, n: int, first: int, switches: Sequence[int], slides: Sequence[Slide], linear: LinearSystem
 ) -> Sliding | None:
-    """The program; None where pieces act on more than the right side, or not each for itself."""
+    """The sliding program; None if pieces act on more than the right side of A z = r, or not independently."""
     rows = SlidingRows.from_slides(line, n, first, switches, slides)
     acts = rows.find_forces(linear)
-    if acts is None or rows.bends(linear.right, acts, range(first, first + len(switches))):
+    if acts is None or rows.is_nonlinear(linear.right, acts, range(first, first + len(switches))):
         return None
     forces = _SlidingForces(line, rows, linear, acts)
     return None if np.bincount(forces.groups).max() > MOST_COUPLED else forces.build()
 
 
 class _SlidingForces:
-    """The program with μ, one number for each of the rows, as unknowns; `acts` are ∂r/∂μₖ."""
+    """Builder of the sliding program: μ, one per sliding row, are unknowns; `acts` are the sparse vectors ∂r/∂μₖ."""
 
     def __init__(self, line: StraightLine, rows: SlidingRows, linear: LinearSystem, acts: list[Sparse]):
         self.line, self.rows, self.linear, self.acts = line, rows, linear, acts
@@ -119,35 +119,35 @@ class _SlidingForces:
         self.slopes, self.rates, self.levels = zip(*map(rows.rate, range(len(acts))), strict=True)
         self.groups = self._find_groups()
 
-    def where(self, condition: int, x: int) -> int:
-        """x where the condition holds, else zero."""
+    def zero_unless(self, condition: int, x: int) -> int:
+        """The node x where the condition holds, else zero."""
         return self.zero if self.graph.value(x) == 0 else self.f("select", condition, self.zero, x)
 
     def build(self) -> Sliding:
         rows, slopes = self.rows, self.slopes
         responses, effects = self._piece_effects()
-        pushed = self._find_pushed(effects)
+        pushed = self._find_pushed_rows(effects)
         pivots = choose_pivots([constants(self.graph, d) for d in slopes])
-        held = Held(self.graph, rows.n, pushed, slopes, responses, pivots)
-        coupled = Coupled(
+        held = HeldMotion(self.graph, rows.n, pushed, slopes, responses, pivots)
+        coupled = BorderEquations(
             # Borders that are not pushed onto are left, and act on nothing until then.
-            [{i: self.where(p, c) for i, c in act.items()} for p, act in zip(pushed, self.acts, strict=True)],
-            [{i: self.where(p, d) for i, d in of.items()} for p, of in zip(pushed, slopes, strict=True)],
+            [{i: self.zero_unless(p, c) for i, c in act.items()} for p, act in zip(pushed, self.acts, strict=True)],
+            [{i: self.zero_unless(p, d) for i, d in of.items()} for p, of in zip(pushed, slopes, strict=True)],
             self._share_equations(effects, pushed, slopes),
             held.pivots(),
         )
-        ends = list(map(self.where, pushed, self.rates))
-        missing = coupled.missing(self.graph, self.linear.z, ends)
+        ends = list(map(self.zero_unless, pushed, self.rates))
+        missing = coupled.border_residuals(self.graph, self.linear.z, ends)
         mu = self._solve_shares(coupled.equations, missing)
         directions = [self.f("select", p, self.f("neg", x), y) for p, x, y in zip(pushed, missing, mu, strict=True)]
-        z = self._solve_system(coupled.push(self.graph, self.linear.right, mu))
+        z = self._solve_system(coupled.add_forces(self.graph, self.linear.right, mu))
         missed = self._constraint_residuals(z)
         if len(pivots) < len(self.acts) or missed:
             # What has no pivot, and what constraints tie to one, is held by the rounding of rounding.
             rest = self._solve_system([missed.get(i, self.zero) for i in range(len(z))]) if missed else []
             z = [self.f("add", *pair) for pair in zip(z, rest, strict=True)] if missed else z
-            z, mu = coupled.mend(self.graph, self._solve_system, z, mu, ends)
-        z = held.hold(z, self.rates)
+            z, mu = coupled.refine(self.graph, self._solve_system, z, mu, ends)
+        z = held.solve_pivots(z, self.rates)
         shares = [self._upper_share(k, mu, pushed, z, effects) for k in range(len(rows.slides))]
         linear = self._share_system(z, mu, coupled, ends)
         outputs = (*z[: rows.n], *self.line.outputs[rows.n :])
@@ -159,15 +159,15 @@ class _SlidingForces:
         holding = Holding(retraction, of_slides, groups, release)
         return Sliding(line, range(len(self.line.nodes)), shares, linear, holding)
 
-    def _find_pushed(self, effects: Sequence[Sparse]) -> list[int]:
-        """True where both sides push onto the border of each row, and onto all of its slide."""
+    def _find_pushed_rows(self, effects: Sequence[Sparse]) -> list[int]:
+        """For each row a flag: both sides push onto its border, and onto all rows of its slide."""
         pushed = [self.f("lt", row.get(k, self.zero), self.zero) for k, row in enumerate(effects)]
         of_slides = zip(self.rows.flags, self.rows.group(pushed), strict=True)
         every = [functools.reduce(lambda a, b: self.f("and", a, b), of, flag) for flag, of in of_slides]
         return [every[row.slide] for row in self.rows.rows]
 
-    def _build_retraction(self, held: Held, equations: Eliminated, effects, pushed, missing):
-        """The retraction, and the coordinates that each row moves."""
+    def _build_retraction(self, held: HeldMotion, equations: Eliminated, effects, pushed, missing):
+        """The line that projects the state onto the borders, and the coordinates that each row moves."""
         by_position = [k for k in range(len(pushed)) if self.rows.order(k) > 1]
         if by_position:
             at = {m: i for i, m in enumerate(by_position)}
@@ -175,13 +175,13 @@ class _SlidingForces:
             pushes = [self._pushes_back(k, effects, pushed, missing) for k in by_position]
             of_positions = self._share_equations(some, pushes, [self.slopes[k] for k in by_position])
             levels = [self.rows.rows[k].offset for k in by_position]
-            held.put_back(0, by_position, levels, lambda left: of_positions.solve(self.graph, left), pushes)
+            held.set_back(0, by_position, levels, lambda left: of_positions.solve(self.graph, left), pushes)
         solve = functools.partial(equations.solve, self.graph)
-        held.put_back(self.rows.n, range(len(pushed)), self.levels, solve, pushed)
+        held.set_back(self.rows.n, range(len(pushed)), self.levels, solve, pushed)
         return held.finish()
 
     def _find_groups(self) -> list[int]:
-        """The group of each row: what those of different ones move, and read, A does not couple."""
+        """A group number for each row: rows of different groups move and read coordinates that A does not couple."""
         matrix, size = self.linear.entries | self.linear.others, len(self.linear.right)
         rows: list[Sparse] = [{i: self.one} for i in range(size)]
         for (i, j), x in matrix.items():
@@ -213,17 +213,17 @@ class _SlidingForces:
         return results
 
     @functools.cached_property
-    def _split_solution(self) -> StraightLine:
+    def _solution_line(self) -> StraightLine:
         return self.linear.solve()
 
     def _solve_system(self, right: Sequence[int]) -> list[int]:
-        """z of A z = r."""
-        nodes = copy_nodes(self.graph, self._split_solution, [*self.linear.factors, *right])
-        return [nodes[i] for i in self._split_solution.outputs]
+        """The solution z of A z = r, as nodes."""
+        nodes = copy_nodes(self.graph, self._solution_line, [*self.linear.factors, *right])
+        return [nodes[i] for i in self._solution_line.outputs]
 
     def _solve_sparse_sides(self, acts: Sequence[Sparse]) -> list[Sparse]:
-        """z of A z = r for some r of few entries each: only what depends on these is computed."""
-        line, first, results = self._split_solution, len(self.linear.factors), []
+        """The solutions z of A z = r for sparse right-hand sides `acts`; only what depends on these is computed."""
+        line, first, results = self._solution_line, len(self.linear.factors), []
         still = copy_nodes(self.graph, line, [*self.linear.factors, *[self.zero] * len(self.linear.right)])
         inputs = {node[2]: i for i, node in enumerate(line.nodes) if node[0] == "input"}
         readers, places = find_readers(line.nodes), {}
@@ -239,7 +239,7 @@ class _SlidingForces:
         return results
 
     def _constraint_residuals(self, z: Sequence[int]) -> dict[int, int]:
-        """r − A z in the rows of constraints, whose entries are those of coordinates alone."""
+        """The residuals r − A z in the rows of constraints, {row: node}; such a row has entries of coordinates only."""
         entries = self.linear.entries
         rows = set(range(self.rows.n, len(z))) - {i for place in entries if min(place) >= self.rows.n for i in place}
         found = {}
@@ -249,7 +249,7 @@ class _SlidingForces:
         return found
 
     def _piece_effects(self) -> tuple[list[Sparse], list[Sparse]]:
-        """The slopes of z by each piece, and ∂u̇/∂p of each border by each piece."""
+        """The derivatives of z by each piece, and for each border the derivatives of u̇ by each piece, sparse."""
         responses, effects = self._solve_sparse_sides(self.acts), []
         of_coordinates = transpose(responses, len(self.linear.right))
         for d in self.slopes:
@@ -261,10 +261,10 @@ class _SlidingForces:
         return responses, effects
 
     def _share_equations(self, effects: list[Sparse], pushed: Sequence[int], slopes: Sequence[Sparse]) -> Eliminated:
-        """The linear equations of μ; μ = 0 where there is nothing to do."""
+        """The eliminated linear equations of μ; μ = 0 for rows onto which no two sides push."""
         f, rows = self.f, []
         for k, row in enumerate(effects):
-            both = {m: self.where(pushed[k], self.where(pushed[m], x)) for m, x in row.items()}
+            both = {m: self.zero_unless(pushed[k], self.zero_unless(pushed[m], x)) for m, x in row.items()}
             both[k] = f("select", pushed[k], self.one, row.get(k, self.zero))
             rows.append(both)
         whole = []
@@ -275,7 +275,7 @@ class _SlidingForces:
         return Eliminated(eliminate(self.graph, rows), whole)
 
     def _pushes_back(self, j: int, effects, pushed: Sequence[int], missing: Sequence[int]) -> int:
-        """True where border j of positions pushes back what lies next to it; other borders may hold that there, too."""
+        """The flag that border j by position pushes a state next to it back, where no border by velocity holds it."""
         f, others = self.f, [k for k in range(len(pushed)) if k != j]
         if all(self.rows.order(k) > 1 for k in others):
             return pushed[j]
@@ -286,7 +286,7 @@ class _SlidingForces:
             beside = [
                 f("sub", x, f("mul", effects[k][j], change)) if j in effects[k] else x for k, x in enumerate(missing)
             ]
-            mu = self._solve_shares(equations, list(map(self.where, without, beside)))
+            mu = self._solve_shares(equations, list(map(self.zero_unless, without, beside)))
             for k in others:
                 held = f("lt", f("abs", f("add", mu[k], self.graph.number(self.rows.rows[k].below))), self.one)
                 stays = f("and", stays, f("or", f("not", pushed[k]), held))
@@ -296,7 +296,7 @@ class _SlidingForces:
         return f("and", pushed[j], f("not", stays))
 
     def _solve_shares(self, equations: Eliminated, missing: list[int]) -> list[int]:
-        """μ; where borders share what they hold, μ − 1 is to be small: the distance from the middle of both sides."""
+        """The solution μ; for dependent borders the one with the smallest distance from the middle, |μ − 1|."""
         if not equations.whole:
             return equations.solve(self.graph, missing)
         f, rows = self.f, equations.whole
@@ -305,7 +305,7 @@ class _SlidingForces:
         return [f("sub", x, p) for x, p in zip(equations.solve(self.graph, there), below, strict=True)]
 
     def _are_dependent(self, slopes: Sequence[Sparse]) -> bool:
-        """True if the rates of some borders are combinations of others, so that these can share what they hold."""
+        """True if the rates of some borders are linear combinations of others, so that their forces are not unique."""
         some, groups = np.random.default_rng(0), {}
         known = [constants(self.graph, of_one) for of_one in slopes]
         for k, group in enumerate(find_groups(slopes, self.rows.n)):
@@ -321,9 +321,9 @@ class _SlidingForces:
         return False
 
     def _upper_share(self, k: int, unknown: Sequence[int], pushed: Sequence[int], z, effects) -> int:
-        """The share of the upper side: μ/2, and far beyond 0 or 1 where both sides do not push.
+        """The share of the upper side of slide k: μ/2; far beyond 0 or 1 where the two sides do not push onto it.
 
-        Of a cone, which holds up to a length of 1, it is what is left of the square of that, of 1/4: never 1.
+        For a cone, which holds while |μ| < 1, it is (1 − |μ|²) / 4, never 1.
         """
         f, half = self.f, self.graph.number(0.5)
         rows = self.rows.of_slides[k]
@@ -336,7 +336,7 @@ class _SlidingForces:
         beyond = f("select", self.rows.flags[k], half, f("add", half, f("mul", self.graph.number(FAR), moves)))
         return f("select", pushed[row], beyond, f("mul", half, mu[0]))
 
-    def _share_system(self, z: list[int], mu: list[int], coupled: Coupled, ends: list[int]) -> LinearSystem:
+    def _share_system(self, z: list[int], mu: list[int], coupled: BorderEquations, ends: list[int]) -> LinearSystem:
         system, count, graph = self.linear, len(self.linear.right), self.graph
         others = {(i, count + k): self.f("neg", c) for k, act in enumerate(coupled.acts) for i, c in act.items()}
         entries = ((k, i, d) for k, of_one in enumerate(coupled.normals) for i, d in of_one.items())

@@ -1,4 +1,4 @@
-"""Linear equations whose entries are nodes of a graph: a few at a time, or sparse ones."""
+"""Small or sparse linear equations whose entries are nodes of a graph."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -9,21 +9,21 @@ import scipy
 from lagjax._program._graph import Graph
 
 # Borders that are not independent share what they hold as if they yielded by `SOFT`, relative; the remaining error is
-# corrected `MENDED` times. The share of what no border holds alone is as exact as rounding, divided by it.
-SOFT, MENDED = 1e-9, 2
+# corrected `REFINEMENTS` times. The share of what no border holds alone is as exact as rounding, divided by it.
+SOFT, REFINEMENTS = 1e-9, 2
 
 Sparse = dict[int, int]  # the nodes of a vector by their place in it; what is not there is zero
 
 
 class Eliminated(NamedTuple):
-    """Linear equations after `eliminate`, and as they are where they are solved softly (`SOFT`)."""
+    """The factors of a linear system, and its rows `whole` where it is regularised (`SOFT`) and needs refinement."""
 
     factors: list[Sparse]
     whole: list[Sparse]
 
     def solve(self, graph: Graph, right: Sequence[int]) -> list[int]:
         x = substitute(graph, self.factors, right)
-        for _ in range(MENDED if self.whole else 0):
+        for _ in range(REFINEMENTS if self.whole else 0):
             products = (dot(graph, row.values(), [x[j] for j in row]) for row in self.whole)
             left = [graph.apply("sub", b, product) for b, product in zip(right, products, strict=True)]
             more = substitute(graph, self.factors, left)
@@ -32,7 +32,7 @@ class Eliminated(NamedTuple):
 
 
 def constants(graph: Graph, row: Sparse) -> dict[int, float | None]:
-    """The numbers that are not zero throughout; None for those that are no constants."""
+    """The entries of a sparse row that are not identically zero: their constant values, or None where they vary."""
     values = {i: graph.value(d) for i, d in row.items()}
     return {i: value for i, value in values.items() if value != 0}
 
@@ -42,7 +42,7 @@ def drop_entry(row: Sparse, place: int) -> Sparse:
 
 
 def transpose(rows: Sequence[Sparse], count: int) -> list[Sparse]:
-    """The first columns of a matrix, `count` of them."""
+    """The first `count` columns of a sparse matrix given by rows, as sparse rows."""
     columns: list[Sparse] = [{} for _ in range(count)]
     for k, row in enumerate(rows):
         for i, x in row.items():
@@ -52,7 +52,7 @@ def transpose(rows: Sequence[Sparse], count: int) -> list[Sparse]:
 
 
 def find_groups(rows: Sequence[Sparse], count: int) -> list[int]:
-    """The group of each row, as small as possible: rows of different groups share none of the `count` columns."""
+    """A group number for each row: the connected components of rows that share one of the `count` columns."""
     places = np.array([(k, len(rows) + i) for k, row in enumerate(rows) for i in row], int).reshape(-1, 2).T
     size = len(rows) + count
     graph = scipy.sparse.coo_array((np.ones(places.shape[1]), tuple(places)), (size, size))
@@ -73,7 +73,7 @@ def dot(graph: Graph, xs: Iterable[int], ys: Iterable[int]) -> int:
 
 
 def eliminate(graph: Graph, rows: list[Sparse]) -> list[Sparse]:
-    """L and U in the place of each other's zeros, without the ones of L: A = L U, of the rows of A, in place."""
+    """LU factors of a sparse matrix by rows, in place and without pivoting; the unit diagonal of L is not stored."""
     f, zero = graph.apply, graph.number(0.0)
     readers = [set(column) for column in transpose(rows, len(rows))]
     for k, pivot in enumerate(rows):
@@ -88,7 +88,7 @@ def eliminate(graph: Graph, rows: list[Sparse]) -> list[Sparse]:
 
 
 def substitute(graph: Graph, rows: Sequence[Sparse], right: Sequence[int]) -> list[int]:
-    """x of A x = b, of what `eliminate` made of A."""
+    """The solution x of A x = b by substitution; `rows` are the factors from `eliminate`, `right` is b."""
     f, x, zero = graph.apply, list(right), graph.number(0.0)
     for i, row in enumerate(rows):
         for k in sorted(k for k in row if k < i):

@@ -1,8 +1,8 @@
-"""From a scene and its start to a motion in the user's own pytree.
+"""The integration of a scene from its start: a motion in the user's own pytree.
 
-`_simulate` holds `simulate` and `simulate_batch`, `_crossings` the instants at which a function of the state changes
+`_simulate` has `simulate` and `simulate_batch`, `_crossings` the instants at which a function of the state changes
 sign, `hybrid/` motions through modes, `contacts/` those with contacts, `jumps/` what these two share. `_trajectory` is
-what they return, `_batch_members` its members along one axis, `_states_between` its states between the outputs.
+the type of their results, `_batch_members` its members along one axis, `_states_between` its states between outputs.
 """
 
 from lagjax._run._batch_members import Members

@@ -7,18 +7,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._interface import Layout, is_concrete, numbers_at
 from lagjax._run._trajectory import EACH, Trajectory
-
-PyTree = Any
-
 
 _SHARED = "shared"  # stands for the batch axis of what all members share
 
 
 def _numbers_in_front(trajectory: Trajectory, batch: tuple[int, ...]) -> tuple[PyTree, PyTree]:
-    """The numbers in params with the axes of the batch in front, of size 1 where members share them; and the rest."""
+    """The numbers in params with the batch axes first, of size 1 where members share them; and the rest of params."""
     axes, rank = trajectory.params_axes, len(batch)
     # Of the axes of a batch, the innermost may share some parameters (`Trajectory.map_members`).
     outer = rank - (rank > 0 and axes != EACH)
@@ -43,7 +41,7 @@ def _numbers_in_front(trajectory: Trajectory, batch: tuple[int, ...]) -> tuple[P
 
 
 def spread_params(trajectory: Trajectory, member: np.ndarray) -> tuple[PyTree, PyTree]:
-    """The params of lanes that follow a `member` (L,) each, and the axis of lanes for each leaf, None where shared."""
+    """The params for lanes of which each follows a `member` (L,), and per leaf the axis of lanes, None if shared."""
     batch = np.shape(trajectory.result._value)
     numbers, code = _numbers_in_front(trajectory, batch)
 
@@ -57,6 +55,16 @@ def spread_params(trajectory: Trajectory, member: np.ndarray) -> tuple[PyTree, P
     return eqx.combine(jax.tree.map(lanes, numbers), code), axes
 
 
+def spread_rows(x, batch: tuple[int, ...], dimensions: int):
+    """An array of this many `dimensions` for every member of a batch, (N, …), also where all share it."""
+    library: Any = np if is_concrete(x) else jnp
+    x = library.asarray(x)
+    if x.ndim < len(batch) + dimensions:
+        x = library.expand_dims(x, x.ndim - dimensions)
+    own = x.shape[x.ndim - dimensions :]
+    return library.broadcast_to(x, batch + own).reshape(math.prod(batch), *own)
+
+
 class Members:
     def __init__(self, trajectory: Trajectory):
         self.batch = np.shape(trajectory.result._value)
@@ -66,7 +74,7 @@ class Members:
         self.numbers, self.params = self._parameters()
 
     def _parameters(self) -> tuple[list[np.ndarray], PyTree]:
-        """Every number in params, () where all members share it, else (N,); and the params of one member."""
+        """Every number in params, () if all members share it, else (N,); and the params of one member."""
         numbers, code = _numbers_in_front(self.trajectory, self.batch)
         leaves, structure = jax.tree.flatten(numbers)
         columns, of_one = [], []
@@ -80,19 +88,15 @@ class Members:
         return columns, eqx.combine(jax.tree.unflatten(structure, of_one), code)
 
     def flat(self, tree: PyTree, axes: int = 1) -> np.ndarray:
-        """The leaves of q or qdot end to end, (N, S, n)."""
+        """The leaves of q or qdot concatenated, (N, S, n)."""
         lead = len(self.batch) + axes
         parts = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
         parts = [x.reshape(self.count, *x.shape[len(self.batch) : lead], -1) for x in parts]
         return np.concatenate(parts, axis=-1)
 
     def shared(self, x, dimensions: int) -> np.ndarray:
-        """Times or tolerances, arrays of this many dimensions, for every member: (N, …), also where all share them."""
-        x = np.asarray(x)
-        if x.ndim < len(self.batch) + dimensions:
-            x = np.expand_dims(x, x.ndim - dimensions)
-        own = x.shape[len(self.batch) :]
-        return np.broadcast_to(x, self.batch + own).reshape(self.count, *own)
+        """Times or tolerances, arrays of this many dimensions, broadcast to all members: (N, …)."""
+        return spread_rows(np.asarray(x), self.batch, dimensions)
 
     def numbers_of(self, k: int) -> np.ndarray:
         return np.array([x if np.ndim(x) == 0 else x[k] for x in self.numbers])

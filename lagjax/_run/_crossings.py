@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine import Problem, Solution
 from lagjax._engine.taylor import MachineCode, Noted, Surfaces, surfaces_of
@@ -30,13 +31,12 @@ from lagjax._interface import (
     require_flag,
     show_str,
 )
-from lagjax._primitives import lost_unless, marks_absent, raise_where_failed, sentence
+from lagjax._primitives import allows_nan, raise_where_failed, sentence, undefined_unless
 from lagjax._program import Unlowerable
 from lagjax._run._trajectory import Trajectory
 from lagjax._run.contacts import note_sections
 from lagjax._run.hybrid import Hybrid, Scene, follow_modes, require_scene
 
-PyTree = Any
 _TOO_MANY = code_of(RESULTS.max_crossings_reached)
 
 
@@ -65,7 +65,7 @@ class Crossings(NamedTuple):
         return f"{count.sum()} crossings{many}{when}, {'all there' if ok.all() else f'not all there in {(~ok).sum()}'}"
 
 
-@marks_absent
+@allows_nan
 def crossings(
     system: Scene,
     section: Callable | dict[str, Callable],
@@ -151,7 +151,7 @@ def crossings(
 
 
 def _notes_from_hybrid(run: Trajectory, first: int, sections: int) -> tuple:
-    """The notes of a hybrid motion, as of `note_sections`: of transitions from place `first` of the list on."""
+    """The notes of a hybrid motion, as from `note_sections`: its transitions with numbers from `first` on."""
     changes, flatten = run.transitions, Layout.from_state(*run.end[1:]).flatten
     assert changes is not None
     # A section that holds where the motion begins is met at once, and not crossed.
@@ -162,12 +162,12 @@ def _notes_from_hybrid(run: Trajectory, first: int, sections: int) -> tuple:
 
 
 def _read_crossings(notes: tuple, ts, sections: int, count: int, layout: Layout, names, throw: bool, inputs):
-    """The crossings among the changes of a motion that jumps; they vary with the `inputs`, or have no derivative."""
+    """The crossings among the changes of a motion that jumps; differentiable by the `inputs`, or NaN derivatives."""
     (which, t, y), result, end = notes
     there = which == jnp.arange(sections)[:, None]
     places = jnp.argsort(~there, axis=1, stable=True)[:, :count]
     found = jnp.take_along_axis(there, places, axis=1)
-    t, y = lost_unless(found, t[places], inputs), lost_unless(found[..., None], y[places], inputs)
+    t, y = undefined_unless(found, t[places], inputs), undefined_unless(found[..., None], y[places], inputs)
     noted, many = Noted(t, y, there.sum(axis=1)), there.sum(axis=1) > count
     if throw:
         noted = _raise_unless_ok(layout, ts, end, noted, jnp.where(many.any(), _TOO_MANY, result))
@@ -175,7 +175,7 @@ def _read_crossings(notes: tuple, ts, sections: int, count: int, layout: Layout,
 
 
 def _overall_result(noted: Noted, solution: Solution, count: int, library: Any = np) -> tuple:
-    """The result of the whole, the time and state up to which all is there, and which sections have all crossings."""
+    """The result code, the time and state up to which it is complete, and which sections have all crossings."""
     well, many = solution.result == SUCCESSFUL, noted.count > count
     too_many = well & library.any(many)
     # The last crossing that there was room for, of the first section to run out of it.
@@ -190,7 +190,7 @@ _how_it_ended_traced = jax.jit(functools.partial(_overall_result, library=jnp), 
 
 
 def _raise_unless_ok(layout: Layout, ts, end: tuple, noted: Noted, result) -> Noted:
-    """The crossings, where all went well; else `SimulationError`, at run time where it is being traced."""
+    """The crossings if all went well; else `SimulationError`, at run time if traced."""
     if not all(map(is_concrete, (result, *end, ts))):
         t, y = raise_where_failed((noted.t, noted.y), result, end, ts[-1], layout.names)
         return noted._replace(t=t, y=y)
@@ -200,7 +200,7 @@ def _raise_unless_ok(layout: Layout, ts, end: tuple, noted: Noted, result) -> No
 
 
 def restore_crossings(layout: Layout, names, noted: Noted, ok) -> Crossings | dict[str, Crossings]:
-    """The crossings in the pytree of the user, and by the names of the sections."""
+    """The crossings in the user's pytree, in a dict if the sections have names."""
 
     def section_crossings(k: int) -> Crossings:
         q, qdot = map(layout.restore, halves(jnp.asarray(noted.y[k])))
@@ -237,7 +237,7 @@ def directions_of(direction, names) -> tuple[int, ...]:
 
 
 def surfaces_in(problem: Problem, functions, directions, names) -> Surfaces:
-    """The sections as programs. Raises `ValueError` where there is no machine code, or a section never changes."""
+    """The sections as programs. Raises `ValueError` without machine code, or if a section never changes."""
     if problem.is_single:
         with jax.enable_x64(True):
             return surfaces_in(problem.double_precision, functions, directions, names)

@@ -15,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine import AbstractEngine, Batch, Problem, Solution, axes_per_leaf, choose, requested_engine
 from lagjax._engine.taylor import MachineCode
@@ -30,7 +31,7 @@ from lagjax._interface import (
     require_flag,
     result_from,
 )
-from lagjax._primitives import marks_absent
+from lagjax._primitives import allows_nan
 from lagjax._run._trajectory import EACH, RunSettings, State, Trajectory, raise_unless_ok, step_counts
 from lagjax._run.contacts import follow_contacts, follow_contacts_batch
 from lagjax._run.hybrid import Hybrid, follow_modes
@@ -39,7 +40,6 @@ from lagjax._scene import System, lift_batch, lift_problem, require_system
 if TYPE_CHECKING:
     import diffrax
 
-PyTree = Any
 
 _TIMES = "the times at which the state is wanted, from the start to the end, are ts"
 _ELSEWHERE = {  # words of SciPy and diffrax
@@ -56,7 +56,7 @@ _ELSEWHERE = {  # words of SciPy and diffrax
 
 
 def _translate_keywords(function: Callable) -> Callable:
-    """A decorator: keywords of other packages are told what to write."""
+    """A decorator: keywords of other packages raise an error that tells what to write instead."""
 
     @functools.wraps(function)
     def translated(*args, **keywords):
@@ -68,7 +68,7 @@ def _translate_keywords(function: Callable) -> Callable:
 
 
 @_translate_keywords
-@marks_absent
+@allows_nan
 def simulate(
     system: System | Hybrid,
     q0: PyTree,
@@ -207,7 +207,7 @@ def simulate(
 
 
 @_translate_keywords
-@marks_absent
+@allows_nan
 def simulate_batch(
     system: System | Hybrid,
     q0: PyTree,
@@ -286,7 +286,7 @@ def simulate_batch(
 
 
 def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, y0, params: PyTree, params_axes=EACH):
-    """The solution of a problem, or a batch, in the pytree of the user; `y0` and `params` are those of all members."""
+    """The solution of a problem, or a batch, in the user's pytree; `y0` and `params` are those of all members."""
     # Where nothing is traced, the few numbers stay in NumPy: each one sent to JAX costs as much as ten steps.
     fields = problem.layout, solution.path, solution.y_end, solution.accepted, solution.rejected
     if not isinstance(solution.y_end, np.ndarray):
@@ -329,7 +329,7 @@ def _refuse_options(scene: str, options: dict[str, Any]) -> None:
 
 
 def _device_arrays(arrays: tuple) -> tuple:
-    """NumPy arrays as arrays of JAX."""
+    """NumPy arrays converted to JAX arrays."""
     # `jax.device_put` takes as long as a short motion, a compiled function of arrays of these shapes a tenth of that:
     # it is compiled for one motion. In a process that was forked nothing can be compiled: XLA's threads did not come
     # along.
@@ -343,7 +343,7 @@ _as_they_are = jax.jit(lambda *arrays: arrays)
 
 
 def _mask_inconsistent(trajectory: Trajectory, inconsistent: jax.Array) -> Trajectory:
-    """The trajectory in which members that did not start on their constraints are NaN, with a result that says so."""
+    """The trajectory with members that did not start on their constraints set to NaN, and their result code."""
 
     def masked(leaf):
         return jnp.where(inconsistent.reshape(-1, *[1] * (leaf.ndim - 1)), jnp.nan, leaf)

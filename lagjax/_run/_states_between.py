@@ -2,9 +2,9 @@
 
     (trajectory, t) ─► LanePlaces ─► one batch, a lane for each time ─► State
 
-A lane runs from the time of an output, and the state there, to t. A time that is an output has the numbers of that
-output. Where times are being traced it is not known which of them are outputs: all have a lane, which at an output
-runs on to the next one, for the sake of its derivatives, and its numbers give way to those of the output.
+A lane runs from the time of an output, and the state there, to t. A time that is an output gets the numbers of that
+output. If times are traced it is unknown which of them are outputs: all have a lane, which at an output runs on to the
+next one, so that its derivative is right, and its values are replaced by those of the output.
 """
 
 from typing import Any, NamedTuple
@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine import Batch
 from lagjax._interface import (
@@ -25,17 +26,15 @@ from lagjax._interface import (
     require_numbers,
     result_from,
 )
-from lagjax._run._batch_members import spread_params
+from lagjax._run._batch_members import spread_params, spread_rows
 from lagjax._run._trajectory import RunSettings, State, Trajectory
 from lagjax._run.contacts import follow_contacts_batch
 from lagjax._run.hybrid import Hybrid, follow_modes
 from lagjax._scene import lift_batch
 
-PyTree = Any
-
 
 def find_states(run: Trajectory, t) -> State:
-    """The states at times t, whose axes come behind those of the batch (see `Trajectory.at`)."""
+    """The states at times t, whose axes follow those of the batch (see `Trajectory.at`)."""
     settings, batch = _require_settings(run), jnp.shape(run.result._value)
     run._require_present()
     times, shape = _spread_times(run, t, batch)
@@ -77,7 +76,7 @@ def _states_at_places(run: Trajectory, settings: "RunSettings", places: "LanePla
 
 @jax.custom_jvp
 def _exchange_value(x, value):
-    """`value` with the derivatives of x."""
+    """The numbers `value`, with the derivatives of x."""
     return value
 
 
@@ -87,10 +86,10 @@ def _exchange_value_jvp(primals, tangents):
 
 
 class LanePlaces(NamedTuple):
-    """The places of K times in each of N motions, with T outputs each.
+    """The positions of K times in each of N motions, with T outputs each.
 
-    - `times`: the times, (N, K); `live`: where the motion has been then.
-    - `output`: the last output that is not behind a time, and `is_output`: whether it is at that time.
+    - `times`: the times, (N, K); `live`: the motion reached that time.
+    - `output`: the last output at or before a time, and `is_output`: it is at that time.
     - `begin`: the output from which a run leads to a time, (N, K), and its output times `ts`: (N, K, 2), or (N, K, 3)
       where times are traced, of which the second is that time.
     """
@@ -108,8 +107,8 @@ class LanePlaces(NamedTuple):
 
     @classmethod
     def from_trajectory(cls, run: Trajectory, times, batch: tuple[int, ...]) -> "LanePlaces":
-        """The places of times (N, K); raises `ValueError` where one lies outside of the motion."""
-        ts = _spread_rows(run.ts, batch, 1)
+        """The positions of times (N, K); raises `ValueError` if one lies outside of the motion."""
+        ts = spread_rows(run.ts, batch, 1)
         xp: Any = np if all(map(is_concrete, (times, ts))) else jnp
         ts, times = (xp.asarray(x) for x in (ts, times))
         way = xp.where(ts[:, -1:] > ts[:, :1], 1, -1).astype(ts.dtype)
@@ -121,7 +120,7 @@ class LanePlaces(NamedTuple):
         rows = np.arange(len(ts))[:, None]
         is_output = inside & (ts[rows, output] == times)
         # As far as the motion came: a run begins at an output that was reached.
-        end, code = (_spread_rows(x, batch, 0)[:, None] for x in (run.end.t, run.result._value))
+        end, code = (spread_rows(x, batch, 0)[:, None] for x in (run.end.t, run.result._value))
         known = xp is np and all(map(is_concrete, (end, code)))
         library: Any = np if known else jnp
         end, code = library.asarray(end), library.asarray(code)
@@ -140,7 +139,7 @@ class LanePlaces(NamedTuple):
 
 
 def _search_rows(xp, rows, values):
-    """For values (N, K) the last place in increasing rows (N, T) that is not larger; −1 where there is none."""
+    """For values (N, K) the last index in increasing rows (N, T) whose entry is not larger; −1 if there is none."""
     if xp is jnp:
         return jax.vmap(lambda row, x: jnp.searchsorted(row, x, side="right"))(rows, values) - 1
     return np.stack([np.searchsorted(row, x, side="right") for row, x in zip(rows, values, strict=True)]) - 1
@@ -149,7 +148,7 @@ def _search_rows(xp, rows, values):
 def _follow_lanes(run: Trajectory, settings: "RunSettings", ts, member: np.ndarray, state: tuple) -> PyTree:
     """q and q̇, (L, …), at the second of the times `ts` (L, ≥ 2) of runs from a state: q, q̇ and the mode at the first.
 
-    Raises `SimulationError` where one of them is known to have failed.
+    Raises `SimulationError` if one of them is known to have failed.
     """
     (q, qdot, mode), (params, axes) = state, spread_params(run, member)
     tolerances = settings.tolerances or run.tolerances
@@ -189,7 +188,7 @@ def _follow_lanes(run: Trajectory, settings: "RunSettings", ts, member: np.ndarr
 
 
 def _spread_times(run: Trajectory, t, batch: tuple[int, ...]) -> tuple[Any, tuple[int, ...]]:
-    """The times of each of N members, (N, K), and the shape that the states have in front."""
+    """The times of each of N members, (N, K), and the leading shape of the states."""
     t = t if isinstance(t, jax.Array) else np.asarray(t)
     require_numbers(t, "t")
     require_finite(t, "t")
@@ -208,21 +207,11 @@ def _spread_times(run: Trajectory, t, batch: tuple[int, ...]) -> tuple[Any, tupl
     return times.reshape(-1, t.shape[-1]), shape
 
 
-def _spread_rows(x, batch: tuple[int, ...], dimensions: int):
-    """An array of so many dimensions for every member, (N, …), also where they share it."""
-    library: Any = np if is_concrete(x) else jnp
-    x = library.asarray(x)
-    if x.ndim < len(batch) + dimensions:
-        x = library.expand_dims(x, x.ndim - dimensions)
-    own = x.shape[x.ndim - dimensions :]
-    return library.broadcast_to(x, batch + own).reshape(-1, *own)
-
-
 # ---- what can be wrong -----------------------------------------------------------------------------------------------
 
 
 def _require_settings(run: Trajectory) -> RunSettings:
-    """The settings of a trajectory. Raises `ValueError` where it has none, or no scene."""
+    """The settings of a trajectory. Raises `ValueError` if it has none, or no scene."""
     if run.system is None or run.settings is None:
         raise ValueError(
             "This trajectory does not say how it was integrated, or of which system it is: states between its outputs "

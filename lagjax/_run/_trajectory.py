@@ -1,8 +1,8 @@
-"""`Trajectory`: what comes out, in the user's own pytree.
+"""`Trajectory`: the result of a simulation, in the user's own pytree.
 
 Time is the first axis of `q` and `qdot`; the members of a batch are an axis before it. Quantities derived from the
-states are methods: they cost nothing until they are called, and they are differentiable. What judges and shows a
-motion (`_trust`, `_show`) stands above it: its methods call it through `_interface._registered`.
+states are methods: they cost nothing until they are called, and they are differentiable. Rooms that judge and show a
+motion (`_trust`, `_show`) import this one: its methods call them through `_interface._registered`.
 """
 
 import dataclasses
@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine import AbstractEngine, Problem
 from lagjax._equations import has_constraints
@@ -28,13 +29,12 @@ from lagjax._interface import (
     registered,
     show_str,
 )
-from lagjax._primitives import DOUBLE, compute_in_doubles, marks_absent, raise_where_failed
+from lagjax._primitives import DOUBLE, allows_nan, compute_in_doubles, raise_where_failed
 from lagjax._scene import System, describe_violation
 
 if TYPE_CHECKING:
     import lagjax
 
-PyTree = Any
 Number = jax.Array | np.ndarray
 
 
@@ -111,7 +111,7 @@ class Impacts(NamedTuple):
 
 
 def _list_first(record: Any, what: str, joint: str, describe: Callable, numbers: tuple, between: str = ", ") -> str:
-    """A line that counts what a record holds and describes the first ten of its `numbers`; its fields where traced."""
+    """One line that counts the entries of a record and describes the first ten; the fields of a traced record."""
     count = record.count
     if not (eqx.is_array_like(count) and is_known(count) and all(map(is_known, jax.tree.leaves(numbers)))):
         return f"{type(record).__name__}({', '.join(f'{name}={x!r}' for name, x in record._asdict().items())})"
@@ -125,7 +125,7 @@ def _list_first(record: Any, what: str, joint: str, describe: Callable, numbers:
 
 @jax.tree_util.register_static
 class Names(tuple):
-    """Names that travel with arrays, through every transformation of JAX."""
+    """A tuple of names that is part of a pytree with arrays, under every transformation of JAX."""
 
 
 CHANGE_WORDS = ("closes", "opens", "bounces", "sticks", "slides")  # in words
@@ -185,10 +185,10 @@ class ContactChanges(NamedTuple):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True, eq=False)
 class RunSettings:
-    """The engine of a motion and its options, which another run of its scene needs. Equal to one with equal values.
+    """The engine of a motion and its options, for further runs of its scene. Compared by value.
 
-    - `engine`: what integrated it; None where numbers of its solver were being traced.
-    - `tolerances`: rtol and atol as they were given; None where they were being traced.
+    - `engine`: that which integrated it; None if numbers of its solver were traced.
+    - `tolerances`: rtol and atol as they were given; None if they were traced.
     - `max_steps`, `max_transitions`: the budgets of a run; `transitions`: those of a `Hybrid`.
     """
 
@@ -300,7 +300,7 @@ class Trajectory(eqx.Module):
         code = self.result._value
         return (code == RESULTS.successful._value) | (code == RESULTS.event_occurred._value)
 
-    @marks_absent
+    @allows_nan
     def at(self, t) -> State:
         """The states at times t between the outputs, as exact as these: each by a run from the output before it.
 
@@ -350,7 +350,7 @@ class Trajectory(eqx.Module):
             raise ValueError("This motion has no contacts: give contacts=... or one_way=... to its System.")
         return self._forces_in_contact("contact_forces")
 
-    @marks_absent
+    @allows_nan
     def _forces_in_contact(self, name: str) -> PyTree:
         self._require_present()
         return registered().contact_forces(self, name)
@@ -395,7 +395,7 @@ class Trajectory(eqx.Module):
         """f and a at every output time, in the structure of `multipliers`: the drift off the constraints."""
         return self._map_outputs("constraint_residual")
 
-    @marks_absent
+    @allows_nan
     def health(self, reference: "Trajectory | None" = None) -> "lagjax.results.Health":
         """The trust that this motion deserves: conservation laws, constraints, the mass matrix, gradients.
 
@@ -504,11 +504,11 @@ class Trajectory(eqx.Module):
         return mapped(self.q, self.qdot, (self.ts, self.tolerances), numbers, self.mode, *more)
 
     def _require_present(self) -> None:
-        """Raise `ValueError` where the scene reads other values by now than when this motion was followed."""
+        """Raise `ValueError` if values that the scene's functions read have changed since this motion."""
         for system in (self.system,) if isinstance(self.system, System) else self.system.values():
             system._require_present()
 
-    @marks_absent
+    @allows_nan
     def _map_outputs(self, name: str, *more: PyTree) -> PyTree:
         """Map a method (q, qdot, t, params, *more) of the system over time, and over the batch axes before it."""
         self._require_present()
@@ -535,7 +535,7 @@ class Trajectory(eqx.Module):
 
 
 def _require_equal_constraints(modes: dict[str, System], name: str, q, qdot, params) -> None:
-    """Raise where modes do not have the same constraints, so that there is no one structure to return."""
+    """Raise if modes have different constraints, so that their results have no common structure."""
     constrained = [which for which, system in modes.items() if has_constraints(system)]
     structures = [modes[which]._constraint_structure(Layout.from_state(q, qdot), params) for which in constrained]
     if len(constrained) < len(modes) or any(structure != structures[0] for structure in structures):
@@ -547,7 +547,7 @@ def _require_equal_constraints(modes: dict[str, System], name: str, q, qdot, par
 
 
 def constant_unless(varies, tree: PyTree) -> PyTree:
-    """The numbers of a pytree, without derivatives unless `varies` holds."""
+    """The numbers of a pytree, without derivatives unless `varies` is true."""
 
     def constant(x):
         if not eqx.is_array_like(x):
@@ -559,7 +559,7 @@ def constant_unless(varies, tree: PyTree) -> PyTree:
 
 
 def follow_in_doubles(motion: Callable, problem: Problem, *more) -> Any:
-    """`motion(layout, ts, y0, params, *more)` of a problem, in float64, in the problem's own precision."""
+    """`motion(layout, ts, y0, params, *more)` of a problem in float64, converted to the problem's precision."""
     given = problem.ts, problem.y0, problem.params, *more
     if not problem.is_single:
         return motion(problem.layout, *given)
@@ -568,16 +568,16 @@ def follow_in_doubles(motion: Callable, problem: Problem, *more) -> Any:
 
 
 def follow_in_numbers(follow: Callable, problem: Problem, *more) -> Any:
-    """`follow_rows` of the one member of a problem, without the axis of members."""
+    """`follow_rows` for the one member of a problem, without the axis of members."""
     rows = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
     found = follow_rows(follow, problem, *rows, *more)
     return jax.tree.map(lambda x: np.asarray(x)[0], found)
 
 
 def follow_rows(follow: Callable, member: Problem, ts, y0, vectors, *more) -> Any:
-    """`follow(layout, params, ts, y0, vectors, *more)` of members whose numbers are known, in the own precision.
+    """`follow(layout, params, ts, y0, vectors, *more)` of members with concrete numbers, in their precision.
 
-    There are `ts` (N, T) or (1, T), `y0` (N, 2n), `vectors` (N, P) or (1, P); the rest is that of one `member`.
+    They have `ts` (N, T) or (1, T), `y0` (N, 2n), `vectors` (N, P) or (1, P); the rest is that of one `member`.
     """
 
     def run(ts, y0, vectors):
@@ -593,7 +593,7 @@ def step_counts(accepted, rejected) -> dict:
 
 
 def raise_unless_ok(trajectory: Trajectory, layout: Layout, why: Callable[[], str | None]) -> Trajectory:
-    """Raise `SimulationError` for a trajectory that did not reach its end; at run time when it is being traced."""
+    """Raise `SimulationError` for a trajectory that did not reach its end; at run time if it is traced."""
     # `why()` are the words for what stopped it, where they are known better than by the result.
     end, code = trajectory.end, trajectory.result._value
     if is_known(code) and int(code) in ENDED_WELL:

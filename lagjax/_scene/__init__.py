@@ -17,6 +17,7 @@ from lagjax._scene._system import (
     System,
     Time,
     describe_violation,
+    drop_contacts,
     present_system,
     replace_functions,
     require_coefficients,

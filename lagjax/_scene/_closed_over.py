@@ -14,13 +14,12 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 from jax.extend import core
+from jaxtyping import PyTree
 
 from lagjax._engine import Batch, Problem
 from lagjax._interface import Function
 from lagjax._interface.reads import Edition, place_in
 from lagjax._scene._system import ARGUMENTS, ROLES, replace_functions
-
-PyTree = Any
 
 
 class Lifted(NamedTuple):

@@ -17,12 +17,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+from jaxtyping import PyTree
 
 from lagjax._equations import Constraints, Motion, couple_forces, once_for_structure
 from lagjax._interface import Layout, is_concrete
 from lagjax._scene._system import System, name_numbers
-
-PyTree = Any
 
 
 class Contacts(NamedTuple):

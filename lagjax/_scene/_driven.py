@@ -11,12 +11,11 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from lagjax._interface import Function, accept, restrict_signature
 from lagjax._interface.reads import Edition
 from lagjax._scene._system import ROLES, System, replace_functions
-
-PyTree = Any
 
 
 class Driven(NamedTuple):
@@ -85,7 +84,7 @@ def push_by_inputs(system: System) -> System:
 
     extras = {"inputs", *(() if own is None else own.extras)}
     pushed = accept(restrict_signature(forces, extras), "forces", extras=("t", "params", "inputs", "multipliers"))
-    return replace_functions(system, {role: getattr(system, role) for role in ROLES} | {"forces": pushed})
+    return replace_functions(system, {"forces": pushed})
 
 
 def asking_for_inputs(system: System) -> list[str]:

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from lagjax._engine import Problem
 from lagjax._engine.taylor import lowered_motion
@@ -34,7 +34,6 @@ from lagjax._primitives import SINGLE, compute_in_doubles, nan_unless
 from lagjax._program import Unlowerable, lack_of_memory
 from lagjax._scene._explanation import Explanation, explain
 
-PyTree = Any
 # The functions of a scene by their roles, and the arguments of each that come by position.
 ARGUMENTS: dict[str, tuple[str, ...]] = {
     "lagrangian": ("q", "qdot"), "forces": ("q", "qdot"), "dissipation": ("q", "qdot"), "constraints": ("q",),
@@ -688,11 +687,17 @@ def present_system(system: System) -> System:
 
 
 def replace_functions(system: System, functions: dict[str, Function | None], path: str | None = None) -> System:
-    """The scene with other functions, by their roles, without the constructor: to read signatures takes long."""
-    other = object.__new__(type(system))
-    for name, value in (functions | {"path": path or system.path, "impacts": system.impacts}).items():
+    """The scene with some functions replaced, by their roles. The constructor would read all signatures again."""
+    other, fields = object.__new__(type(system)), object.__getattribute__(system, "__dict__")
+    for name, value in (fields | functions | {"path": path or fields["path"]}).items():
         object.__setattr__(other, name, value)
     return other
+
+
+def drop_contacts(system: System) -> System:
+    """The scene without contacts; itself where it has none."""
+    names = "contacts", "one_way", "restitution", "friction", "slip"
+    return replace_functions(system, dict.fromkeys(names)) if system.touches else system
 
 
 @eqx.filter_jit

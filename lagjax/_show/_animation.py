@@ -21,7 +21,6 @@ from lagjax._show._course import course_of_member
 from lagjax._show._notebook import COLORS, simplify_axes
 from lagjax._show._summary import import_package, require_numbers
 
-PyTree = Any
 MEMBERS = 50  # that are drawn of a batch, the first ones
 FRAMES = 20_000  # of which a film has fewer
 TRAIL = 2.0  # seconds of the film over which a trace fades

@@ -7,9 +7,10 @@ one Newton step back to them.
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._equations import Derivation, derivation_of
 from lagjax._interface import VERSION, Layout, number_names
@@ -21,7 +22,6 @@ from lagjax._tracing import Program, fold, lower_formula, stack
 if TYPE_CHECKING:
     from lagjax._scene import System
 
-PyTree = Any
 
 _HEAD = """\
 /* The equations of motion of a scene, by lagjax {version}, in C99 without libraries but math.h.
@@ -100,13 +100,10 @@ class _SceneSource:
         functions = [self._write_quantity(what, line, says) for what, (line, says) in self._write_functions().items()]
         functions.append(self._write_step())
         helpers = self.numbers.helpers("".join(functions))
-        head = _HEAD.format(version=VERSION, order=self._argument_order())
+        orders = {"q, qdot, qddot": self.places["q"], **{array: self.places[array] for array in self.arrays}}
+        rows = (f"   {arrays:16s} {', '.join(names)}" for arrays, names in orders.items())
+        head = _HEAD.format(version=VERSION, order="\n".join(rows).replace("*/", "* /"))
         return "\n".join([head, *helpers, *functions])
-
-    def _argument_order(self) -> str:
-        rows = [f"   {'q, qdot, qddot':16s} {', '.join(self.places['q'])}"]
-        rows += [f"   {array:16s} {', '.join(self.places[array])}" for array in self.arrays]
-        return "\n".join(rows).replace("*/", "* /")
 
     def _write_functions(self) -> dict[str, tuple[StraightLine, str]]:
         """The functions: the line of each, and a comment."""

@@ -4,17 +4,17 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import PyTree
 
-from lagjax._equations import Derivation, derivation_of
+from lagjax._equations import derivation_of
 from lagjax._interface import Layout, number_names, show_str
-from lagjax._program import Formulas, Sum, Unlowerable
+from lagjax._program import Formulas, Unlowerable
 from lagjax._scene import Driven, drive_scene, held_inputs
 from lagjax._show._formula_text import LATEX, PYTHON, FormulaWriter, Name, input_names, shared_parts, short_names
 
 if TYPE_CHECKING:
     from lagjax._scene import System
 
-PyTree = Any
 
 # Operations of M, F, G and γ that are read: a double pendulum has 40, three links in space 400. Four times as many fill
 # ten pages, and take a second to put together.
@@ -55,17 +55,11 @@ class Equations:
         of = "M q'' = F + G^T lambda, G q'' = gamma" if self.constraints else "M q'' = F"
         lines = [f"{of}; M is symmetric, and what is not listed is 0.", ""]
         lines += [f"{name} = {formula}" for name, formula in self.parts.items()]
-        for title, formulas in self._matrix_tables().items():
-            lines += [
-                f"{title}[{key if isinstance(key, str) else ', '.join(key)}] = {formula}"
-                for key, formula in formulas.items()
-            ]
+        tables = self.mass_matrix, self.force, self.constraints, self.jacobian, self.gamma
+        for title, formulas in zip(("M", "F", "f", "G", "gamma"), tables, strict=True):
+            named = ((key if isinstance(key, str) else ", ".join(key), formula) for key, formula in formulas.items())
+            lines += [f"{title}[{key}] = {formula}" for key, formula in named]
         return "\n".join(lines)
-
-    def _matrix_tables(self) -> dict[str, dict]:
-        return {
-            "M": self.mass_matrix, "F": self.force, "f": self.constraints, "G": self.jacobian, "gamma": self.gamma,
-        }  # fmt: skip
 
     def _repr_latex_(self) -> str:
         return f"$$\n{self.latex}\n$$" if self.latex else self.note
@@ -91,14 +85,10 @@ def write_equations(system: "System", layout: Layout, params: PyTree, inputs: Py
             "they contain."
         )
     found = Formulas(line, 2 * layout.size + 1)
-    sums: dict[str, Any] = dict(zip(quantities, _split_name(derivation, found, quantities), strict=True))
-    return _FormulaPage(found, sums, input_names(layout.names, numbers), names).equations()
-
-
-def _split_name(derivation: Derivation, found: Formulas, quantities: tuple[str, ...]) -> list[np.ndarray]:
     outputs = np.empty(len(found.outputs), object)
     outputs[:] = found.outputs
-    return list(derivation.split_outputs(quantities, outputs).values())
+    sums = derivation.split_outputs(quantities, outputs)
+    return _FormulaPage(found, sums, input_names(layout.names, numbers), names).equations()
 
 
 class _FormulaPage:
@@ -142,8 +132,8 @@ class _FormulaPage:
                 rows = r" \\ ".join(" & ".join(map(self.latex.write, np.atleast_1d(row))) for row in of)
                 lines.append(rf"{sign} &= \begin{{pmatrix}} {rows} \end{{pmatrix}}")
             elif of.size:
-                lines += [self._entry(sign, at, x) for at, x in np.ndenumerate(of) if x and at == tuple(sorted(at))]
+                entries = [(at, x) for at, x in np.ndenumerate(of) if x and at == tuple(sorted(at))]
+                places = [" ".join(str(i + 1) for i in at) for at, _ in entries]
+                written = zip(places, (self.latex.write(x) for _, x in entries), strict=True)
+                lines += [rf"{sign}_{{{place}}} &= {formula}" for place, formula in written]
         return "\\begin{aligned}\n" + " \\\\\n".join([law, *lines]) + "\n\\end{aligned}"
-
-    def _entry(self, sign: str, at: tuple[int, ...], x: Sum) -> str:
-        return rf"{sign}_{{{' '.join(str(i + 1) for i in at)}}} &= {self.latex.write(x)}"

@@ -5,16 +5,14 @@ those per unit of time. They stand in the `attrs` of what comes out, and not in 
 """
 
 import math
-from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._interface import is_known, labelled_leaves
 from lagjax._run import CHANGE_WORDS, Members
 from lagjax._show._summary import import_package, require_numbers
-
-PyTree = Any
 
 
 def dataset(trajectory, units: PyTree = None, time_unit: str | None = None):

@@ -23,6 +23,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._interface import output_times, require_flag
 from lagjax._run.hybrid import Hybrid, Scene, jumps, require_scene
@@ -42,8 +43,6 @@ from lagjax._sweep._workers import (
     units_to_compute,
     work,
 )
-
-PyTree = Any
 
 
 @dataclass(frozen=True)

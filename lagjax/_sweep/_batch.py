@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine import Batch, Solution, axes_per_leaf
 from lagjax._engine.taylor import MachineCode, Noted, flow_of, tolerances_of
@@ -34,7 +35,6 @@ from lagjax._run.hybrid import Hybrid, jumps
 from lagjax._sweep._description import NOT_TRACEABLE, Description, Sections
 from lagjax._sweep._files import RESULT, Quantity
 
-PyTree = Any
 _Kept = tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]  # values, |h − h₀| and complaints
 KEEP_FAILED = 1001  # a result code of the sweep's own, far from those of `lagjax.RESULTS`
 NAMES = {KEEP_FAILED: "keep_failed"}

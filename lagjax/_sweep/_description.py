@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine.taylor import MachineCode
 from lagjax._interface import accept, output_times, require_budget
@@ -30,7 +31,6 @@ from lagjax._show import import_package
 from lagjax._sweep._members import Axis, describe_axes
 from lagjax._sweep._statistics import Statistics
 
-PyTree = Any
 MOTION = (*ROLES, "q0", "qdot0", "params")  # what a motion depends on, besides its tolerances
 NOT_TRACEABLE = (jax.errors.JAXTypeError, jax.errors.JAXIndexError)
 _OF_EVENTS = ("direction", "root_finder")  # what a diffrax.Event has besides its condition

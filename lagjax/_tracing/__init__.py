@@ -70,9 +70,9 @@ from lagjax._tracing.lowering._rules import (
 def lower(function: Callable, *examples, budget: int = 20_000, moving: int = 0) -> "Program":
     """The scalar program of `function` at arguments like `examples` (arrays, `ShapeDtypeStruct`s, or pytrees of them).
 
-    The first `moving` numbers among the inputs are those of the motion (`Graph`).
-    Raises `Unlowerable`, with a sentence, for a primitive without a scalar form, for indices and loops that depend on
-    the values of the inputs, and for more than `budget` scalar operations; the last without doing the work first.
+    The first `moving` scalars among the inputs vary along a motion (`Graph`). Raises `Unlowerable`, with a sentence,
+    for a primitive without a scalar form, for indices and loops that depend on the values of the inputs, and for more
+    than `budget` scalar operations; the last without doing the work first.
     """
     leaves, structure = jax.tree.flatten(examples)
     shapes = tuple(jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
@@ -87,7 +87,7 @@ def lower(function: Callable, *examples, budget: int = 20_000, moving: int = 0) 
 def lower_scalars(
     scalars: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], budget: int, moving: int = 0
 ) -> "Program":
-    """The program of the id arrays that `scalars(expansion, arguments)` makes of those of its inputs."""
+    """The program of a function `scalars(expansion, arguments)` from id arrays of inputs to those of outputs."""
     expansion = Expansion(Graph(budget, moving))
     expansion.work(sum(math.prod(shape.shape) for shape in shapes))
     arguments = inputs_of(expansion.graph, shapes)
@@ -100,7 +100,7 @@ def lower_scalars(
 
 
 def lower_formula(formula: Callable, *shapes, budget: int) -> "Program":
-    """The program of a formula: a function of numbers, each a `Scalars` (), that gives a vector."""
+    """The program of a formula: a function of `Scalars`, one per input, that returns a vector."""
 
     def scalars(expansion, arguments):
         return [formula(*(Scalars(expansion, x) for x in arguments)).ids]
@@ -109,12 +109,12 @@ def lower_formula(formula: Callable, *shapes, budget: int) -> "Program":
 
 
 def lower_solution(system: Callable, solve: Callable, size: int, *shapes, budget: int) -> "Program":
-    """The program of the first `size` components of z with A z = r, and of one more number.
+    """The program of the first `size` components of z with A z = r, and of one further number.
 
-    A is symmetric, but for entries above its diagonal that are added to those. Both functions are formulas (see
-    `lower_formula`) on numbers of these `shapes`. `system(*numbers)` gives the rows and columns (k, 2) of entries of A
-    on and below its diagonal, and of those added, these entries (k,), r, what `solve` needs of A, a tree
-    of vectors, and that number; `solve(factors, r)` gives z, and is linear in r.
+    A is symmetric up to entries added above its diagonal. Both functions are formulas (see `lower_formula`) on numbers
+    of these `shapes`. `system(*numbers)` gives the rows and columns (k, 2) of entries of A on and below its diagonal,
+    and of those added, these entries (k,), r, what `solve` needs of A, a tree of vectors, and the further number;
+    `solve(factors, r)` gives z, and is linear in r.
     """
     counts: list = []
 
@@ -153,7 +153,7 @@ def lower_solution(system: Callable, solve: Callable, size: int, *shapes, budget
 
 
 def compose(outer: "Program", inner: "Program", budget: int, moving: int) -> "Program":
-    """The program of `outer`, whose last array is that of the outputs of `inner`, a program of the other inputs."""
+    """The composition of two programs: `inner` computes the last array of `outer` from the inputs before it."""
 
     def scalars(expansion, arguments):
         ids = np.concatenate([x.ravel() for x in arguments])
@@ -165,14 +165,13 @@ def compose(outer: "Program", inner: "Program", budget: int, moving: int) -> "Pr
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """A straight line of scalar operations; made by `lower`, compared and hashed by identity.
+    """A straight line of scalar operations as a function in JAX; made by `lower`, compared and hashed by identity.
 
-    `nodes` holds the operations in order, as triples `(op, operands, attribute)`, and `outputs` the positions in it
-    of the results. `traced_operations` counts the scalar operations of the function as written. A program that does not
-    hold for all inputs says so in its last output, and `otherwise()` is the one for those. Where the outputs are the
-    solution of a linear system, `linear` is that. `mechanics` gives what L and the constraints are (`_kick.Mechanics`)
-    from the same inputs, where L or a constraint is piecewise. `residual()` is a program that is zero at the solution,
-    its last inputs, by which its derivatives are A.
+    `line` has the operations and outputs; `traced_operations` counts the scalar operations of the function as written.
+    A program that is not valid for all inputs says so in its last output, and `otherwise()` is one that is. If the
+    outputs solve a linear system, `linear` is that. `mechanics` gives L and the constraints (`_kick.Mechanics`) from
+    the same inputs, if L or a constraint is piecewise. `residual()` is a program that is zero at the solution, its last
+    inputs, by which its derivatives are A.
     """
 
     line: StraightLine
@@ -185,22 +184,22 @@ class Program:
 
     @property
     def complete(self) -> "Program":
-        """The program that holds for all inputs."""
+        """The program that is valid for all inputs."""
         return self if self.otherwise is None else self.otherwise()
 
     def __call__(self, *scalars) -> tuple:
-        """The outputs, one per scalar; see the module's text for lanes and precision."""
+        """The outputs, one per scalar input; see the module's text for lanes and precision."""
         if len(scalars) != self.size:
             raise TypeError(f"this program takes {self.size} scalars, not {len(scalars)}")
         return self._differentiable_call(*scalars)
 
     def vector(self, *scalars) -> Scalars:
-        """The outputs as one vector, in a formula of `Scalars`, of whose graph the program becomes part."""
+        """The outputs as one vector of `Scalars`: the program is copied into their graph."""
         inputs = stack(scalars)
         return Scalars(inputs.expansion, self.place(inputs.expansion, inputs.ids)[list(self.line.outputs)])
 
     def place(self, expansion: Expansion, ids: np.ndarray) -> np.ndarray:
-        """The nodes of the program in the graph where its inputs are these `ids`, (inputs,)."""
+        """The nodes of the program, copied into a graph where its inputs are the nodes `ids` (inputs,)."""
         graph, inputs = expansion.graph, ids.tolist()
         expansion.traced_operations += self.operations
         places = [graph.position(i) for i in inputs] if self.looks_up else None
@@ -208,13 +207,13 @@ class Program:
 
     @property
     def looks_up(self) -> bool:
-        """True if it reads tables (see `_look_ups`)."""
+        """True if the program reads tables (see `_look_ups`)."""
         return self.line.looks_up
 
     def compute_outputs(self, first, numbers) -> tuple:
-        """The outputs at inputs `first` (m,), then `numbers` (P,), which stay one array where they are many.
+        """The outputs at inputs `first` (m,), then `numbers` (P,), which stay one array if there are many.
 
-        There derivatives are those of the operations as they stand.
+        In that case derivatives are those of the operations as written.
         """
         if self.looks_up or self.size > LARGEST_UNFOLDED:
             return emit_rows(self.line, Rows(first, numbers))
@@ -233,18 +232,18 @@ class Program:
         return tuple(dtype for shape in self.shapes for dtype in [shape.dtype] * math.prod(shape.shape))
 
     def evaluate(self, *numbers) -> np.ndarray:
-        """The outputs (outputs,) at these numbers, operation by operation in NumPy: nothing is compiled."""
+        """The outputs (outputs,) at these numbers, in NumPy without compilation."""
         return self.evaluate_many(numbers)[:, 0]
 
     def evaluate_many(self, columns) -> np.ndarray:
-        """The outputs at S states, shape (outputs, S), in NumPy without compiling anything.
+        """The outputs at S states, shape (outputs, S), in NumPy without compilation.
 
         `columns` has one entry for each input: a number, or S of them, (S,), whose precision is that of floats.
         """
         return self.line.evaluate(columns)
 
     def append_inputs(self, count: int) -> "Program":
-        """The program with `count` more floats after its inputs; it reads none of them."""
+        """The program with `count` further float inputs, which it does not read."""
         more, other = jax.ShapeDtypeStruct((count,), jnp.result_type(float)), self.otherwise
         otherwise = other and functools.cache(lambda: other().append_inputs(count))
         return replace(self, shapes=(*self.shapes, more), otherwise=otherwise)
@@ -254,7 +253,7 @@ class Program:
         return replace(self, line=line, otherwise=None, linear=None)
 
     def rounding_of(self, positions: Sequence[int], moving: int) -> "Program":
-        """The program of the running errors of some outputs (see `_rounding`); it has no derivatives."""
+        """The program of the running errors of the outputs at `positions` (see `_rounding`); it has no derivatives."""
         line = eliminate_dead_code(self.line, [self.line.outputs[i] for i in positions])
         graph = Graph.from_line(line, 20 * len(line.nodes) + 1000)
         with np.errstate(all="ignore"):
@@ -307,7 +306,7 @@ class Program:
 
     @functools.cached_property
     def _tangent_programs(self) -> Callable:
-        """`(active)`: the tangents of the floats, from the inputs and the tangents of those that are active."""
+        """A cached function `(active)`: the program of the tangents of float outputs for these active inputs."""
 
         @functools.cache
         def tangent_program(active: tuple[int, ...]) -> Program:

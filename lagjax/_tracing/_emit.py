@@ -1,4 +1,4 @@
-"""From a graph to JAX again: the operations of a program, one after the other, on scalars or on arrays of lanes."""
+"""From a graph back to JAX: the operations of a program, one after the other, on scalars or on arrays of lanes."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -13,7 +13,7 @@ from lagjax._program import BESIDE, LOOK_UPS, OPERATIONS, StraightLine, Table, t
 
 
 def emit(line: StraightLine, scalars: tuple) -> tuple:
-    """The outputs for these inputs, all of the shape the inputs broadcast to."""
+    """The outputs for these inputs, broadcast to the common shape of the inputs."""
     shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in scalars))
 
     def entries(table):
@@ -49,9 +49,9 @@ def _emit_outputs(line: StraightLine, scalars, shape: tuple[Any, ...], entries: 
 
 
 class Rows(NamedTuple):
-    """The inputs of a program as arrays: `first` (…, m) of those that come first, then `numbers` (…, P).
+    """The inputs of a program as arrays: `first` (…, m), then `numbers` (…, P).
 
-    Where there are `pieces`, these come after the first ones, and numbers are only looked up (`_look_ups.BESIDE`).
+    If there are `pieces`, they follow the first inputs, and the numbers are read by look-ups only (`_look_ups.BESIDE`).
     """
 
     first: Any
@@ -68,13 +68,13 @@ class Rows(NamedTuple):
 
 
 def emit_rows(line: StraightLine, rows: Rows) -> tuple:
-    """`emit` for inputs of which most are looked up in tables: none of these is taken apart."""
+    """As `emit`, for inputs in arrays, which are not split into scalars for look-ups."""
     shape = jnp.broadcast_shapes(rows.first.shape[:-1], rows.numbers.shape[:-1])
     return _emit_outputs(line, rows, shape, rows.entries)
 
 
 def emit_look_up(op: str, attribute, entries: Callable, precision, x) -> jax.Array:
-    """An entry of a table, or the piece of one that x is on; `entries(table)` has shape (…, count)."""
+    """An entry of a table, or the interval that contains x; `entries(table)` has shape (…, count)."""
     table = table_of(attribute)
     values = jnp.asarray(entries(table) if table.numbers is None else table.entries).astype(precision)
     if op == "take":
@@ -96,7 +96,9 @@ def _power_of_two(x):
     return jnp.where(jnp.isfinite(x), power, jnp.abs(x))
 
 
-WRITTEN: dict[str, Callable] = {"binade": _power_of_two, "trunc": jnp.trunc}  # operations that `lax` does not have
+WRITTEN: dict[str, Callable] = {  # operations that `lax` does not have
+    "binade": _power_of_two, "trunc": jnp.trunc, "logaddexp": jnp.logaddexp,
+}  # fmt: skip
 
 
 def _apply_operation(op: str, xs: list, attribute) -> jax.Array:
@@ -105,7 +107,7 @@ def _apply_operation(op: str, xs: list, attribute) -> jax.Array:
 
 
 def apply_in_jax(op: str, *xs, attribute=None) -> jax.Array:
-    """The operation on arrays that broadcast: `f` of the formulas of `_operations`, in JAX."""
+    """The operation on arrays that broadcast: the function `f` of the formulas of `_operations`, in JAX."""
     dtype = jnp.result_type(*xs)
     return _apply_operation(op, _align_shapes([jnp.asarray(x, dtype) for x in xs]), attribute)
 
@@ -113,7 +115,7 @@ def apply_in_jax(op: str, *xs, attribute=None) -> jax.Array:
 @jax.custom_jvp
 @compiled_once
 def _sincos(x) -> tuple:
-    """Sine and cosine, once: XLA on CPUs fuses operations into a loop for each output, and repeats what they share."""
+    """Sine and cosine in one compiled function, which XLA on CPUs would otherwise repeat in every fused loop."""
     return lax.sin(x), lax.cos(x)
 
 
@@ -124,7 +126,7 @@ def _derive_sincos(xs, moving):
 
 
 def _align_shapes(values: list) -> list:
-    """Operands of one shape: `lax` does not broadcast, which is why it is quick to trace."""
+    """Operands broadcast to one shape: `lax` functions do not broadcast, which makes them quick to trace."""
     shapes = {value.shape for value in values}
     if len(shapes) == 1:
         return values

@@ -1,7 +1,7 @@
-"""Formulas on the scalars of a graph, written like those on arrays: `Scalars` is to an id array what `jax.Array` is.
+"""`Scalars`: arrays of graph nodes with the operators of arrays, for writing formulas that become nodes.
 
 An elimination has more operations than JAX should have to trace one by one. Written with the operators of `Scalars` and
-the functions below, it makes nodes of a graph. Other operands of these than `Scalars` are numbers, or arrays of them.
+the functions below, it creates nodes of a graph directly. Other operands are numbers or arrays of numbers.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,7 +14,7 @@ import numpy as np
 
 
 class Scalars:
-    """Nodes of a graph as an array: arithmetic, comparisons of numbers, indexing by numbers."""
+    """An array of graph nodes: arithmetic, comparisons, indexing by numbers."""
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -26,7 +26,7 @@ class Scalars:
         return self.ids.shape
 
     def map(self, op: str, *operands) -> "Scalars":
-        """An operation on arrays or numbers that broadcast."""
+        """An operation on `Scalars` and numbers, which broadcast."""
         return Scalars(self.expansion, self.expansion.map(op, *map(self._ids, operands)))
 
     def _ids(self, x) -> np.ndarray:
@@ -66,12 +66,12 @@ binade, prefers, logarithm, root, maximum, absolute = map(_function, ("binade", 
 
 
 def where(condition, yes, no) -> Scalars:
-    """`yes` where the condition holds, else `no`."""
+    """`yes` where the condition is true, else `no`."""
     return _first_scalars((condition, yes, no)).map("select", condition, no, yes)
 
 
 def fold(op: str, x: Scalars) -> Scalars:
-    """The sum ("add"), smallest ("min"), largest ("max") or disjunction ("or") of a vector that is not empty."""
+    """The sum ("add"), smallest ("min"), largest ("max") or disjunction ("or") of a nonempty vector."""
     nonzero = x.ids[x.ids != x.expansion.graph.number(0.0)]
     return Scalars(x.expansion, x.expansion.fold(op, nonzero if op == "add" and nonzero.size else x.ids))
 
@@ -88,18 +88,18 @@ def replace_entries(x: Scalars, index, values) -> Scalars:
 
 
 def scatter(x: Scalars, index, size: int) -> Scalars:
-    """A vector of `size` numbers, zero but for those of x at these places."""
+    """A vector of `size` numbers, zero except for the entries of x at these indices."""
     zeros = np.full(size, x.expansion.graph.number(0.0))
     return replace_entries(Scalars(x.expansion, zeros), index, x)
 
 
 def filled(x: Scalars) -> np.ndarray:
-    """True for the entries that are not zero as they are derived."""
+    """A mask of the entries that are not structurally zero."""
     return x.ids != x.expansion.graph.number(0.0)
 
 
 def multiply(a: Sequence[Scalars], b: Sequence[Scalars]) -> Scalars:
-    """The inner products of vectors a with vectors b, one row after the other: of few entries, as most are zero."""
+    """The inner products of vectors a with vectors b, as rows of one vector; structural zeros are skipped."""
     rows, columns = (np.stack([filled(x) for x in xs]) for xs in (a, b))
     found = scatter(a[0][:0], np.zeros(0, int), len(a) * len(b))
     meet = rows.astype(float) @ columns.T.astype(float) > 0
@@ -116,7 +116,7 @@ def stack(parts: Sequence) -> Scalars:
 
 
 def apply_function(function: Callable, *arguments: Scalars) -> Scalars:
-    """A function in JAX of vectors."""
+    """A JAX function of vectors, applied to `Scalars`."""
     expansion = arguments[0].expansion
     jaxpr = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(x.shape, jnp.result_type(float)) for x in arguments))
     (result,) = expansion.run_closed(jaxpr, [x.ids for x in arguments])

@@ -160,11 +160,7 @@ def _describe_gaps(system: System, layout: Layout, params, ended: Ended) -> tupl
                 touching.append(name)
     if not touching:
         return "", ""
-    law = (
-        _NO_MULTIPLIERS.replace("its law", "the law of forces")
-        if system.reads_multipliers and _CODES.get(ended.code) == "nonfinite_state"
-        else ""
-    )
+    law = _NO_MULTIPLIERS if system.reads_multipliers and _CODES.get(ended.code) == "nonfinite_state" else ""
     return "", f"\nIn touch there: {join_names(touching)}, whose gaps and slips may have corners as L has{law}."
 
 

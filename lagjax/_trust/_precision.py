@@ -15,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine import LEAST_RTOL
 from lagjax._engine.diffrax import LEAST_RTOL_OF_DIFFRAX, FineOutput
@@ -22,8 +23,6 @@ from lagjax._engine.taylor import MachineCode
 from lagjax._interface import as_arrays, show_str
 from lagjax._run import Members, Trajectory, simulate, simulate_batch
 from lagjax._scene import System, require_system
-
-PyTree = Any
 
 _TOLERANCES = {np.dtype("float64"): (1e-4, 1e-6, 1e-8, 1e-10, 1e-12), np.dtype("float32"): (1e-2, 1e-3, 1e-4, 1e-5)}
 # Tolerances of the reference and of the solve that checks it, in units of the round-off. Any tighter, and round-off in

@@ -9,75 +9,14 @@
 Every function in `ALL` can be called without arguments, and returns a `Scene`.
 """
 
+from lagjax.scenes import _charges, _constrained, _coordinate_systems, _gravity, _mechanisms, _particles
 from lagjax.scenes import _de421 as de421
-from lagjax.scenes._charges import (
-    charge_in_fields,
-    charge_in_uniform_fields,
-    gyration,
-    relativistic_charge_in_electric_field,
-    relativistic_charge_in_magnetic_field,
-)
-from lagjax.scenes._constrained import (
-    Blade,
-    Disc,
-    Rolling,
-    SliderCrank,
-    Squeezer,
-    andrews_squeezer,
-    bead_on_wire,
-    cartesian_chain,
-    cartesian_double_pendulum,
-    cartesian_of_angles,
-    cartesian_pendulum,
-    chaplygin_sleigh,
-    knife_edge,
-    particle_on_sphere,
-    rolling_cylinder,
-    rolling_cylinder_multipliers,
-    rolling_disc,
-    slider_crank,
-    wire_multiplier,
-)
-from lagjax.scenes._coordinate_systems import Cartesian, Cylindrical, Polar, Spherical, convert
-from lagjax.scenes._gravity import (
-    eccentric_anomaly,
-    figure_eight,
-    kepler,
-    n_body,
-    newtonian_solar_system,
-    restricted_three_body,
-    solar_system,
-)
-from lagjax.scenes._mechanisms import (
-    Direction,
-    SlowAndFast,
-    Swing,
-    WedgeAndMass,
-    chain,
-    damped_driven_oscillator,
-    double_pendulum,
-    double_pendulum_frequencies,
-    driven_oscillator,
-    driven_pendulum,
-    fermi_pasta_ulam,
-    oscillatory_energies,
-    pendulum,
-    spherical_pendulum,
-    swinging_atwood,
-    wedge,
-    wedge_accelerations,
-)
-from lagjax.scenes._particles import (
-    bead_on_rotating_hoop,
-    central_force,
-    free_particle,
-    harmonic_oscillator,
-    morse_oscillator,
-    one_dimension,
-    particle_in_potential,
-    particles,
-    uniform_gravity,
-)
+from lagjax.scenes._charges import *
+from lagjax.scenes._constrained import *
+from lagjax.scenes._coordinate_systems import *
+from lagjax.scenes._gravity import *
+from lagjax.scenes._mechanisms import *
+from lagjax.scenes._particles import *
 from lagjax.scenes._scene import Scene
 
 ALL = (
@@ -91,16 +30,10 @@ ALL = (
     solar_system,
 )  # fmt: skip
 
-__all__ = [
-    "ALL", "Blade", "Cartesian", "Cylindrical", "Direction", "Disc", "Polar", "Rolling", "Scene", "SliderCrank",
-    "SlowAndFast", "Spherical", "Squeezer", "Swing", "WedgeAndMass", "andrews_squeezer", "bead_on_rotating_hoop",
-    "bead_on_wire", "cartesian_chain", "cartesian_double_pendulum", "cartesian_of_angles", "cartesian_pendulum",
-    "central_force", "chain", "chaplygin_sleigh", "charge_in_fields", "charge_in_uniform_fields", "convert",
-    "damped_driven_oscillator", "de421", "double_pendulum", "double_pendulum_frequencies", "driven_oscillator",
-    "driven_pendulum", "eccentric_anomaly", "fermi_pasta_ulam", "figure_eight", "free_particle", "gyration",
-    "harmonic_oscillator", "kepler", "knife_edge", "morse_oscillator", "n_body", "newtonian_solar_system",
-    "one_dimension", "oscillatory_energies", "particle_in_potential", "particle_on_sphere", "particles", "pendulum",
-    "relativistic_charge_in_electric_field", "relativistic_charge_in_magnetic_field", "restricted_three_body",
-    "rolling_cylinder", "rolling_cylinder_multipliers", "rolling_disc", "slider_crank", "solar_system",
-    "spherical_pendulum", "swinging_atwood", "uniform_gravity", "wedge", "wedge_accelerations", "wire_multiplier",
-]  # fmt: skip
+__all__ = ["ALL", "Scene", "de421"]
+__all__ += _charges.__all__
+__all__ += _constrained.__all__
+__all__ += _coordinate_systems.__all__
+__all__ += _gravity.__all__
+__all__ += _mechanisms.__all__
+__all__ += _particles.__all__

@@ -12,6 +12,11 @@ import numpy as np
 from lagjax._scene import System
 from lagjax.scenes._scene import Scene, components, conservative_scene
 
+__all__ = [
+    "charge_in_fields", "charge_in_uniform_fields", "gyration", "relativistic_charge_in_electric_field",
+    "relativistic_charge_in_magnetic_field",
+]  # fmt: skip
+
 
 class _ChargeInFields(eqx.Module):
     phi: Callable = eqx.field(static=True)

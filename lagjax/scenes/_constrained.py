@@ -19,6 +19,13 @@ from lagjax.scenes._mechanisms import _pendulum_exact
 from lagjax.scenes._particles import _uniform_gravity_lagrangian
 from lagjax.scenes._scene import Scene, conservative_scene
 
+__all__ = [
+    "Blade", "Disc", "Rolling", "SliderCrank", "Squeezer", "andrews_squeezer", "bead_on_wire", "cartesian_chain",
+    "cartesian_double_pendulum", "cartesian_of_angles", "cartesian_pendulum", "chaplygin_sleigh", "knife_edge",
+    "particle_on_sphere", "rolling_cylinder", "rolling_cylinder_multipliers", "rolling_disc", "slider_crank",
+    "wire_multiplier",
+]  # fmt: skip
+
 # ---- rolling off a half-cylinder -------------------------------------------------------------------------------------
 
 

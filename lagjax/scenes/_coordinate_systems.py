@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
+__all__ = ["Cartesian", "Cylindrical", "Polar", "Spherical", "convert"]
+
 
 class Cartesian(NamedTuple):
     """Cartesian coordinates (x, y, z) of a particle."""

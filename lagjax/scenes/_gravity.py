@@ -8,6 +8,11 @@ from lagjax._scene import System
 from lagjax.scenes import _de421 as de421
 from lagjax.scenes._scene import Scene, components, conservative_scene, total_momentum
 
+__all__ = [
+    "eccentric_anomaly", "figure_eight", "kepler", "n_body", "newtonian_solar_system", "restricted_three_body",
+    "solar_system",
+]  # fmt: skip
+
 
 def _kepler_lagrangian(q, qdot, params):
     return 0.5 * qdot @ qdot + params["GM"] / jnp.sqrt(q @ q)

@@ -9,6 +9,12 @@ from jax.typing import ArrayLike
 from lagjax._scene import System
 from lagjax.scenes._scene import Scene, conservative_scene
 
+__all__ = [
+    "Direction", "SlowAndFast", "Swing", "WedgeAndMass", "chain", "damped_driven_oscillator", "double_pendulum",
+    "double_pendulum_frequencies", "driven_oscillator", "driven_pendulum", "fermi_pasta_ulam", "oscillatory_energies",
+    "pendulum", "spherical_pendulum", "swinging_atwood", "wedge", "wedge_accelerations",
+]  # fmt: skip
+
 
 class WedgeAndMass(NamedTuple):
     """The position X of the wedge on the ground; the horizontal position x of the mass along the wedge."""

@@ -15,6 +15,11 @@ from lagjax._scene import System
 from lagjax.scenes._coordinate_systems import Cartesian, Polar, angular_momentum_z, convert
 from lagjax.scenes._scene import Scene, components, conservative_scene, total_momentum
 
+__all__ = [
+    "bead_on_rotating_hoop", "central_force", "free_particle", "harmonic_oscillator", "morse_oscillator",
+    "one_dimension", "particle_in_potential", "particles", "uniform_gravity",
+]  # fmt: skip
+
 
 def _free_particle_lagrangian(q, qdot, params):
     return 0.5 * params["m"] * q.speed_squared(qdot)

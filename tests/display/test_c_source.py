@@ -111,6 +111,7 @@ def test_accelerations_of_all_scenes_in_c_have_the_same_bits(built, make):
 def pieces_and_functions(q, v):
     smooth = jnp.tanh(q[0]) + jnp.exp(-(q[1] ** 2)) + jnp.cbrt(q[2]) + jnp.arctan2(q[0], q[1]) + jnp.log1p(q[2] ** 2)
     pieces = jnp.abs(q[0]) + jnp.maximum(q[1], q[2]) + jnp.where(q[0] > q[1], jnp.sinh(q[2]), q[2] ** 3)
+    smooth += jnp.logaddexp(q[0], q[2]) + jax.nn.softplus(9 * q[1])
     return 0.5 * jnp.sum((1.5 + jnp.sin(q)) * v**2) - smooth - pieces - jnp.abs(q[1]) ** 2.5
 
 

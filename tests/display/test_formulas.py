@@ -16,7 +16,7 @@ from lagjax._interface import Layout
 FUNCTIONS = {name: getattr(math, name) for name in dir(math)} | {
     "where": lambda condition, yes, no: yes if condition else no,
     "sign": np.sign, "round": np.round, "abs": abs, "max": max, "min": min, "cbrt": np.cbrt,
-    "inf": math.inf, "logistic": lambda x: 1 / (1 + math.exp(-x)), "rem": math.fmod,
+    "inf": math.inf, "logaddexp": np.logaddexp, "logistic": lambda x: 1 / (1 + math.exp(-x)), "rem": math.fmod,
 }  # fmt: skip
 
 
@@ -260,12 +260,19 @@ def test_numbers_of_float32_have_its_digits():
         assert OSCILLATOR_OF_DIGITS.equations(1.0, 1.0).force["q"] == "-9.81*q - 0.3*q_dot"
 
 
-SMOOTH = lagjax.System(lambda q, v: 0.5 * v**2 - jax.nn.softplus(q))
+ENDLESS = lagjax.System(lambda q, v: 0.5 * v**2 - jnp.where(q == jnp.inf, 1.0, q**2))
+SMOOTH = lagjax.System(lambda q, v: 0.5 * v**2 - jnp.logaddexp(q, v) - jax.nn.softplus(2 * q))
 
 
 def test_infinity_is_a_number_of_formulas():
-    equations = SMOOTH.equations(0.3, 0.2)
+    equations = ENDLESS.equations(0.3, 0.2)
     assert " == inf" in str(equations) and r"\infty" in equations.latex
+    require_equal(ENDLESS, 0.3, 0.2)
+
+
+def test_logarithms_of_sums_of_exponentials_are_one_function():
+    equations = SMOOTH.equations(0.3, 0.2)
+    assert "logistic" in str(equations) and "where" not in str(equations)
     require_equal(SMOOTH, 0.3, 0.2)
 
 

@@ -379,14 +379,14 @@ def test_a_sample_without_programs_is_the_one_with_them(constraints, monkeypatch
         many_states.Sample.from_scene(scene, layout, q, qdot, t, None).quantities(*names)
         for scene in (
             lagjax.System(lagrangian, constraints=constraints),
-            lagjax.System(Held(lagrangian, jnp.ones(())), constraints=constraints),
+            lagjax.System(HeldMotion(lagrangian, jnp.ones(())), constraints=constraints),
         )
     )
     for name in names:
         np.testing.assert_allclose(compiled[name], lowered[name], rtol=1e-13, atol=1e-13)
 
 
-class Held(eqx.Module):
+class HeldMotion(eqx.Module):
     """A Lagrangian that holds an array of its own, so that its scene has no programs."""
 
     function: Callable

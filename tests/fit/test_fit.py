@@ -260,6 +260,15 @@ def test_a_parameter_that_belongs_at_the_end_of_its_set_is_said_to():
     assert "held by the bound 0.2" in fits[2].message and "doubt the scene" in fits[2].message
 
 
+@pytest.mark.parametrize("transform", [lagjax.positive, lagjax.between(0.0, 1e12)])
+def test_a_number_that_begins_next_to_its_bound_is_found(transform):
+    """Friction that is too small by 20 orders: u has no slope there, so that no step within reach promises any gain."""
+    transforms = {"m": None, "l": lagjax.positive, "c": transform}
+    fit = lagjax.fit(SCENE, records(), TRUTH | {"c": 1e-21}, free=FREE, transforms=transforms)
+    low, high = fit.intervals(0.9999)
+    assert fit.ok and low["c"] < TRUTH["c"] < high["c"], fit
+
+
 def test_a_record_that_disagrees_is_named(done):
     [other] = records(1, seed=5, params=TRUTH | {"l": 0.71})
     fit = lagjax.fit(SCENE, [*records(), other], TRUTH, free=FREE, transforms=lagjax.positive)
@@ -274,7 +283,7 @@ def test_a_shift_without_a_record_is_that_of_the_fit_without_it(done):
         fits[0]._point, [np.sqrt(b.weights) / fits[0].noise_scale.sigma for b in fits[0].residual_function.batches]
     )  # fmt: skip
     variances = np.diag(whole.information.covariance), np.diag(whole.information.white)
-    shift = shifts_without(2, triangles, np.arange(4), *variances, np.zeros_like(variances[0]))[0].sizes
+    shift = shifts_without(2, triangles, np.arange(4), *variances, np.zeros_like(variances[0])).sizes[0]
     chance = np.sqrt(np.diag(fits[1].information.white) - np.diag(whole.information.white))
     np.testing.assert_allclose(shift, (fits[1].u - fits[0].u) / chance, atol=0.2)
 

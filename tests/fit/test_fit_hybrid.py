@@ -10,6 +10,7 @@ from scipy.optimize import least_squares
 
 import lagjax
 from lagjax._fit import Point
+from lagjax._primitives import Repetition
 
 G, E, V0 = 9.81, 0.9, 3.0
 
@@ -170,6 +171,25 @@ def test_bounces_that_a_motion_does_not_have_are_counted():
     late = lagjax.Timings(BOUNCE, np.array([0.6, 1.2]), 0.0, (0.5, 0.0), numbers=np.array([0, 9]))
     with pytest.raises(ValueError, match=r"There are \d transitions from 'flight' to 'flight' up to .* but number 9"):
         lagjax.fit(BALL, late, {"e": 0.95})
+
+
+def test_a_trial_plays_its_motion_once(monkeypatch):
+    """The values are those of the search; the rounds are played for the derivatives alone."""
+    played, play = [], Repetition.run
+
+    def count(self, *given, **options):
+        played.append(self)
+        return play(self, *given, **options)
+
+    def path(e):
+        return lagjax.simulate(BALL, 0.5, 0.0, TS[:20], {"e": e}).q
+
+    monkeypatch.setattr(Repetition, "run", count)
+    tangent = jax.jit(lambda e: jax.jvp(path, (e,), (1.0,))[1])(0.9)
+    assert len(played) == 1
+    step = 1e-6
+    change = (np.asarray(path(0.9 + step)) - np.asarray(path(0.9 - step))) / (2 * step)
+    np.testing.assert_allclose(tangent, change, atol=1e-6)
 
 
 # ---- contacts: where one search ends beside the truth ----------------------------------------------------------------

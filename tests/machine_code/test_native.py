@@ -133,7 +133,7 @@ FAMILIES = {  # functions of two doubles and an integer; exact ones, and those o
     ),
     "convert": lambda a, b, n: ((a > 0) * b, n * a, n.astype(float), n.astype(bool), jnp.round(a).astype(int) * b),
     "library": lambda a, b, n: (*(f(a) for f in LIBRARY), jnp.atan2(a, b), jnp.power(abs(a), b)),
-    "of the library's": lambda a, b, n: (jax.nn.sigmoid(a), lax.rsqrt(a)),
+    "of the library's": lambda a, b, n: (jax.nn.sigmoid(a), lax.rsqrt(a), jnp.logaddexp(a, b), jax.nn.softplus(a)),
     "circular": lambda a, b, n: (jnp.sin(a), jnp.cos(a), jnp.sin(b), jnp.cos(a + b)),
     "constants": lambda a, b, n: (1.5, True, a),
     "weights": lambda a, b, n: xp.stack(  # a formula: these come from no primitive

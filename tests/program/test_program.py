@@ -4,6 +4,7 @@ import itertools
 import time
 
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 import numpy as np
@@ -276,6 +277,25 @@ def test_derivatives_at_edges_are_those_of_jax(name):
     if name in ("root of a square", "norm", "hypot"):  # is |x|, whose direction x / |x| has both sides at zero
         points, derived = points[1:], derived[1:]
     np.testing.assert_allclose(derived, jax.jit(jax.vmap(jax.grad(function)))(points), rtol=1e-15)
+
+
+@pytest.mark.parametrize("single", [False, True])
+def test_a_network_of_softplus_has_no_borders(single):
+    """log(eᵃ + eᵇ) is smooth, where JAX writes it with a maximum and a modulus."""
+    weights = np.random.default_rng(0).normal(size=(5, 2))
+
+    def potential(q, weights):
+        return jax.nn.softplus(weights @ q).sum() + jnp.logaddexp(q[0], 2 * q[1]) - jax.nn.log_sigmoid(q[1])
+
+    system = lagjax.System(lambda q, v, params: 0.5 * v @ v - potential(q, params))
+    with jax.enable_x64(not single):
+        q = jnp.asarray([0.3, -0.2])
+        derivation = derivation_of(system, Layout.from_state(q, q), weights)
+        assert derivation.borders.decisions == () and not derivation.has_rules
+        assert system.explain(q, q, params=weights).borders == ()
+        found = jax.jit(jax.vmap(lambda q: system.acceleration(q, q, params=weights)))(jnp.stack([q, -30 * q]))
+        exact = jax.vmap(lambda q: -jax.grad(potential)(q, weights))(jnp.stack([q, -30 * q]))
+        np.testing.assert_allclose(found, exact, rtol=1e-5 if single else 1e-13)
 
 
 # ---- mechanics ------------------------------------------------------------------------------------------------------

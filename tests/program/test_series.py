@@ -104,7 +104,7 @@ def moving(arity):
 
 
 def in_jax(row):
-    return getattr(lax, row.lax or row.name)
+    return getattr(lax, row.lax or row.name, None) or getattr(jnp, row.name)
 
 
 REFERENCES = {  # where mpmath has another name, or none
@@ -149,6 +149,9 @@ POINTS = {  # in mpmath, pairs of values
     "div": (lambda a, b: a / b, [(0.4, -0.9), (0.0, 0.7)]),
     "pow": (mpmath.power, [(0.6, 1.7), (1.3, -0.7)]),
     "atan2": (mpmath.atan2, [(0.7, 0.5), (0.7, -0.5), (-0.7, -0.5), (-0.7, 0.5), (0.7, 1e-3), (1e-3, -2.0)]),
+    "logaddexp": (
+        lambda a, b: mpmath.log(mpmath.exp(a) + mpmath.exp(b)), [(0.4, -0.9), (0.7, 0.7), (25.0, 0.3), (-800.0, 0.3)]
+    ),
     "max": (max, [(0.4, -0.9), (-0.4, 0.9)]),
     "min": (min, [(0.4, -0.9), (-0.4, 0.9)]),
     "rem": (lambda a, b: a - b * int(a / b), [(7.5, 2.0), (-7.5, 2.0), (7.5, -2.0), (0.5, 2.0)]),

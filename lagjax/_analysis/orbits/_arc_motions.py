@@ -7,12 +7,13 @@ nothing, and no kernel of LAPACK runs inside of one.
 """
 
 import copy
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._analysis._scene_state import require_matrices
 from lagjax._analysis.orbits._jumping_motions import JumpingMotions
@@ -30,9 +31,7 @@ from lagjax._interface import (
 )
 from lagjax._primitives import sentence
 from lagjax._run.hybrid import Scene, first_law, jumps, laws, require_scene
-from lagjax._scene import ROLES, replace_functions, require_system
-
-PyTree = Any
+from lagjax._scene import drop_contacts, require_system
 
 
 class Arc(NamedTuple):
@@ -97,10 +96,7 @@ class Arcs:
         scene = require_scene(scene) if may_jump else require_system(scene)
         jumping = JumpingMotions(scene, layout, params, rtol) if jumps(scene) else None
         require_untraced((laws(scene), params), "A parameter")
-        system = first_law(scene)
-        if system.touches:  # its free motion, for units and charts
-            of_contacts = dict.fromkeys(("contacts", "one_way", "restitution", "friction", "slip"))
-            system = replace_functions(system, {role: getattr(system, role) for role in ROLES} | of_contacts)
+        system = drop_contacts(first_law(scene))  # whose free motion is for units and charts
         if any(map(has_constraints, laws(scene))):
             raise ValueError(
                 f"{what} cannot be found with constraints yet: give the scene coordinates that need none, angles of "

@@ -14,18 +14,18 @@ Doedel et al., *Computation of periodic solutions of conservative systems*, Int.
 """
 
 import operator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._analysis.orbits import _shooting
 from lagjax._analysis.orbits._arc_motions import Arcs, starts
 from lagjax._analysis.orbits._continuation import (
     FamilyPoint,
     FamilyTangent,
-    FamilyUnknowns,
     Follower,
     correct,
     next_step,
@@ -38,8 +38,6 @@ from lagjax._equations import decide, span_outside
 from lagjax._interface import Layout, halves, labelled_leaves, require_budget, require_tolerance
 from lagjax._primitives import accepts_singles
 from lagjax._scene import System
-
-PyTree = Any
 
 _SHORTEST = 1e-6  # of the first step: a family that asks for shorter ones ends
 
@@ -277,7 +275,9 @@ def _orbit_between(
     u, width = (s - a) / (b - a), b - a
     shares = (1 + 2 * u) * (1 - u) ** 2, u**2 * (3 - 2 * u), width * u * (1 - u) ** 2, width * u**2 * (u - 1)
     ends = (found[x].point.unknowns for x in (a, b))
-    slopes = (_family_tangent(follower, found[x], across) for x in (a, b))
+    # Tangents of unit length along `across`.
+    along = ((found[x].point, found[x].tangent.vector) for x in (a, b))
+    slopes = (follower.complete_change(point, vector / (vector @ across.vector), 0.0) for point, vector in along)
     guess = jax.tree.map(lambda *parts: sum(map(operator.mul, shares, parts)), *ends, *slopes)
     there = correct(follower, follower.rebuild(found[a].point, guess), across, left_out)
     tangent = None if there is None else tangent_at(follower, there[0], found[a].tangent, left_out)
@@ -287,12 +287,6 @@ def _orbit_between(
 
 
 _ALONG = 0.7  # the cosine of the turn of a tangent between two neighbours, more than which they have by `step_along`
-
-
-def _family_tangent(follower: Follower, member: _Member, across: FamilyTangent) -> FamilyUnknowns:
-    """The tangent of the family at an orbit, of unit length along the tangent `across`."""
-    vector = member.tangent.vector / (member.tangent.vector @ across.vector)
-    return follower.complete_change(member.point, vector, 0.0)
 
 
 def _build_family(follower: Follower, members: list[_Member], message: str) -> Family:
@@ -348,7 +342,9 @@ def branch_off(
     (y0, period, layout), (y0_beside, period_beside, _) = (_orbit_start(family, k, turns) for k in (index, beside))
     place = None if by == "energy" else _parameter_index(params, by)
     arcs = Arcs.from_system(system, layout, params, RTOL, "Families")
-    numbers, numbers_beside = (_orbit_numbers(arcs, place, family, k) for k in (index, beside))
+    numbers, numbers_beside = (np.array(arcs.numbers) for _ in range(2))
+    if place is not None:
+        numbers[place], numbers_beside[place] = (float(family.value[k]) for k in (index, beside))
     follower = Follower(arcs.with_numbers(numbers), place, y0, period)
     here = _first_point(follower, y0, period, numbers)
     before = tangent_at(follower, _first_point(follower, y0_beside, period_beside, numbers_beside), None)
@@ -367,13 +363,6 @@ def _orbit_start(family: Family, k: int, turns: int) -> tuple[np.ndarray, np.nda
     q0, qdot0 = jax.tree.map(lambda x: x[k], (family.q0, family.qdot0))
     period, layout, y0 = starts(q0, qdot0, turns * family.period[k], "period")
     return y0, period.ravel(), layout
-
-
-def _orbit_numbers(arcs: Arcs, place: int | None, family: Family, k: int) -> np.ndarray:
-    numbers = np.array(arcs.numbers)
-    if place is not None:
-        numbers[place] = float(family.value[k])
-    return numbers
 
 
 def _branching_orbit(follower: Follower, here: FamilyPoint, before: FamilyTangent, size: float) -> FamilyPoint | None:

@@ -10,13 +10,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._interface import Function, Layout, halves
 from lagjax._run import simulate
 from lagjax._run.hybrid import Hybrid, Scene, laws
 from lagjax._scene import ROLES
-
-PyTree = Any
 
 # The budgets of changes of one motion, and of one arc whose derivatives are taken: what they record takes memory.
 _CHANGES, _CHANGES_OF_ARC = 4096, 256

@@ -15,14 +15,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._analysis.orbits._arc_motions import Arcs, starts
 from lagjax._interface import SUCCESSFUL, SimulationError, require_flag, show_str
 from lagjax._primitives import accepts_singles, sentence
 from lagjax._run.hybrid import Scene
 from lagjax._scene import System
-
-PyTree = Any
 
 _STEPS_OF_ARC = 8  # along which errors grow tenfold or so: the rounding of its derivative then stays round-off
 _PORTION = 2**15  # arcs that are followed together: some ten megabytes for each coordinate

@@ -1,11 +1,12 @@
 """`periodic_orbit`: motions that return to where they began, from guesses of their start and period."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._analysis.orbits import _shooting
 from lagjax._analysis.orbits._arc_motions import Arcs, starts
@@ -15,8 +16,6 @@ from lagjax._equations import decide, singular_threshold
 from lagjax._interface import SUCCESSFUL, Layout, SimulationError, halves, require_finite, require_flag, require_number
 from lagjax._primitives import accepts_singles
 from lagjax._run.hybrid import Scene
-
-PyTree = Any
 
 # The tolerance of the arcs: their truncation is then below round-off, which is what an orbit closes to.
 RTOL = 2.3e-16

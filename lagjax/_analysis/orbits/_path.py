@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._analysis.orbits._arc_motions import Arcs, Units
 from lagjax._analysis.orbits._shooting import Chain, Closing, close, equations
@@ -30,8 +31,6 @@ from lagjax._interface import Layout, SimulationError, as_arrays, halves, requir
 from lagjax._primitives import accepts_singles
 from lagjax._run import Trajectory, simulate
 from lagjax._scene import System, require_system
-
-PyTree = Any
 
 RTOL = 1e-14
 _ARCS = 8

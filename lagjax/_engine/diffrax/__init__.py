@@ -46,7 +46,7 @@ from lagjax._interface import (
     require_number,
     result_from,
 )
-from lagjax._primitives import DOUBLE, SINGLE, differentiable_where, lost_unless, mark_steps
+from lagjax._primitives import DOUBLE, SINGLE, differentiable_where, mark_steps, undefined_unless
 from lagjax._program import Unlowerable, lack_of_memory, table_of
 
 # Solvers reject steps for the round-off of their error estimate where rtol is below some ten units of it.
@@ -247,7 +247,7 @@ def _solve_problem(engine: Diffrax, problem: Problem) -> Solution:
         well = well & (result._value != EVENT_OCCURRED)
         t_end = differentiable_where(well, t_end, *inputs)
     return solution._replace(
-        path=lost_unless(reached[:, None], solution.path, (given, y0, numbers)),
+        path=undefined_unless(reached[:, None], solution.path, (given, y0, numbers)),
         y_end=differentiable_where(well, y_end, *inputs) if not is_located else differentiable_where(well, y_end),
         t_end=t_end,
         result=result._value,

@@ -1,12 +1,12 @@
 """`MachineCode`: the engine on CPUs (`_gpu_launch`: on GPUs), Taylor series in machine code made for the scene.
 
-Its way: `Problem` ─► `Flow` (rows of NumPy) at once, where nothing is traced; ─► `_primitives`, the flow as primitives
-of JAX, where something is. All of that is in float64; a problem in float32 goes through the door of `_doubles` first.
+Concrete problems: `Problem` ─► `Flow` (rows of NumPy); traced ones: `Problem` ─► `_primitives`, the flow as primitives
+of JAX. All of that is in float64; a problem in float32 is converted by `_doubles` first.
 
-On rows of NumPy: `_flow` (the flow map), `_derivatives` (its jvp and vjp; `_passages`: its steps in parts),
-`_variational` (its variational equations), `_state_rates` (how an output moves with its time). As JAX: `_primitives`,
-which `_call` (CPU) and `_gpu_launch` run; `_line_functions` and `_lowered_motion` for the scene's quantities. Surfaces
-it meets: `_surfaces`, `_crossing`.
+On rows of NumPy: `_flow` (the flow map), `_derivatives` (its jvp and vjp; `_passages`: steps divided for them),
+`_variational` (its variational equations), `_state_rates` (the time derivative of an output). In JAX: `_primitives`,
+executed by `_call` (CPU) and `_gpu_launch`; `_line_functions` and `_lowered_motion` for the scene's quantities.
+Surfaces and events: `_surfaces`, `_crossing`.
 """
 
 import dataclasses
@@ -89,16 +89,16 @@ class MachineCode(AbstractEngine):
     """
 
     def refuses(self, problem: Problem) -> str | None:
-        """Why it cannot solve the problem on a CPU, as the end of a sentence; None where it can."""
+        """The reason why it cannot solve the problem on a CPU, as the end of a sentence; None if it can."""
         lacks = self.lacks(problem)
         if lacks is None and (platform := default_platform()) != "cpu":
             return f"the default device is a {platform}, and `jax.default_device(jax.devices('cpu')[0])` chooses a CPU"
         return lacks
 
     def lacks(self, problem: Problem) -> str | None:
-        """Why there is no machine code for the problem, as the end of a sentence; None where there is.
+        """The reason why there is no machine code for the problem, as the end of a sentence; None if there is.
 
-        Whether a GPU can run it is seen when it is lowered for one.
+        Whether a GPU can run it is known when it is lowered for one.
         """
         if problem.is_single:
             with jax.enable_x64(True):
@@ -112,9 +112,9 @@ class MachineCode(AbstractEngine):
         return None
 
     def declines(self, problem: Problem) -> str | None:
-        """Why it is not the default for the problem, as the end of a sentence; None where it is.
+        """The reason why it is not the default for the problem, as the end of a sentence; None if it is.
 
-        An NVIDIA GPU is no reason where its threads can remember a motion.
+        An NVIDIA GPU is no reason if its threads have memory for a motion.
         """
         if problem.derivation.form.is_sparse and problem.guards is None and not problem.varies:
             return problem.derivation.form.reason
@@ -130,7 +130,7 @@ class MachineCode(AbstractEngine):
         return None
 
     def solve(self, problem: Problem) -> Solution:
-        """The motion of one member, under every transformation of JAX. The problem is one that is not refused."""
+        """The motion of one member, under every transformation of JAX. The problem must not be refused."""
         if problem.is_single:
             return solve_in_doubles(self.solve, problem)
         flow, tolerances = flow_of(problem), tolerances_of(problem)
@@ -144,13 +144,13 @@ class MachineCode(AbstractEngine):
         return _name_events(problem, _primitives.compile_once(motion_to_event, *given)(ts, y0, params))
 
     def refuses_crossings(self, problem: Problem, surfaces: Surfaces) -> str | None:
-        """Why it cannot find the crossings of these surfaces, as the end of a sentence; None where it can."""
+        """The reason why it cannot find crossings of these surfaces, as the end of a sentence; None if it can."""
         return self.refuses(_note_crossings(problem, surfaces))
 
     def crossings(self, problem: Problem, surfaces: Surfaces, room: int, slack: float = 1.0) -> tuple[Solution, Noted]:
-        """The motion of one member, and the crossings of its surfaces, `room` for each, on the way.
+        """The motion of one member, and the crossings of its surfaces, at most `room` for each.
 
-        Derivatives are those of a tolerance that is `slack` times as large.
+        Derivatives have the accuracy of a tolerance that is `slack` times as large.
         """
         if problem.is_single:
             return solve_in_doubles(lambda problem: self.crossings(problem, surfaces, room, slack), problem)
@@ -178,20 +178,20 @@ class MachineCode(AbstractEngine):
 
 
 def _name_events(problem: Problem, solution: Solution) -> Solution:
-    """The solution with which functions of the event ended the motion, in place of how they changed."""
+    """The solution with a flag per event function that ended the motion, in place of its sign change."""
     if problem.event is None:
         return solution
     return solution._replace(event=(solution.event > 0) & (solution.result == EVENT_OCCURRED)[..., None])
 
 
 def _run_one(flow: Flow, problem: Problem, tolerances: Tolerances) -> Solution:
-    """The motion of one member on the host, whose numbers are known."""
+    """The motion of one member on the host, with concrete numbers."""
     ts, y0, params = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
     return Solution._make([*(x[0] for x in flow.run(ts, y0, params, tolerances)[:-1]), None])
 
 
 def flow_of(problem: Problem) -> Flow:
-    """The flow of a problem's scene. Raises `ValueError` where it has none, saying why."""
+    """The flow of a problem's scene. Raises `ValueError`, with the reason, if it has none."""
     if problem.is_single:
         with jax.enable_x64(True):
             return flow_of(problem.double_precision)
@@ -202,7 +202,7 @@ def flow_of(problem: Problem) -> Flow:
 
 
 def make_flow(derivation: Derivation, path: str, guards: Guards | None) -> Flow:
-    """The flow of a scene with these guards. Raises `ValueError` where it has none, saying why."""
+    """The flow of a scene with these guards. Raises `ValueError`, with the reason, if it has none."""
     flow = _make_flow(derivation, path, guards)
     if isinstance(flow, Unlowerable):
         raise ValueError(f"There is no machine code for this scene: {flow}.")
@@ -218,7 +218,7 @@ def _unguarded_flow(problem: Problem) -> Flow:
 
 
 def _find_flow(problem: Problem) -> Flow:
-    """The flow of a problem's scene in float64. Raises `Unlowerable` where it has none."""
+    """The flow of a problem's scene in float64. Raises `Unlowerable` if it has none."""
     guards = problem.guards if problem.event is None else surfaces_of_event(problem).guards()
     flow = _make_flow(problem.derivation.lowered, problem.system.path, guards)
     if isinstance(flow, Unlowerable):
@@ -228,7 +228,7 @@ def _find_flow(problem: Problem) -> Flow:
 
 @functools.lru_cache(maxsize=64)
 def _make_flow(derivation: Derivation, path: str, guards: Guards | None) -> Flow | Unlowerable:
-    """The flow of a scene, or why it has none. Made once."""
+    """The flow of a scene, or an `Unlowerable` with the reason why it has none; cached."""
     if path == "array":
         return Unlowerable("the array path was asked for")
     if derivation.unhashable is not None:
@@ -255,7 +255,7 @@ def _make_flow(derivation: Derivation, path: str, guards: Guards | None) -> Flow
 
 
 def _require_increasing(program: Program, vector) -> None:
-    """Raise `ValueError` where the knots of a look-up, among the parameters, do not increase."""
+    """Raise `ValueError` if the knots of a look-up, among the parameters, do not increase."""
     for op, _, attribute in program.line.nodes if program.looks_up else ():
         if op == "locate" and attribute.table.numbers is None:
             knots = np.asarray(vector)[np.array(attribute.table.positions) - (program.size - len(vector))]

@@ -1,12 +1,12 @@
-"""A run of machine code as XLA calls it: by a handler in machine code, and by Python for all that is rare.
+"""A run of machine code as XLA calls it: by a handler in machine code, and by a Python callback in all rare cases.
 
     members that one thread works on ─► handler ─► all ended well? ─► yes: results, without Python
                                                         └─ no: `Flow.run` continues in a callback
     more members                     ─► `Flow.run` in a callback
     derivatives of a short run       ─► handlers, which run it once more; of others ─► `_derivatives` in a callback
 
-Long runs, second chances, failures and what stopped them are Python's, as are threads and Ctrl-C. The handler is for
-the version of XLA's interface that it knows; where `NO_HANDLER` says why that is another one, every run is a callback.
+Long runs, retries, failures and their reasons are handled in Python, as are threads and Ctrl-C. The handler requires a
+known version of XLA's interface; if `NO_HANDLER` has a reason against it, every run is a callback.
 """
 
 import ctypes
@@ -31,15 +31,15 @@ def begins_in_handler(flow: Flow, members: int) -> bool:
 
 
 def derivatives_begin_in_handler(flow: Flow, members: int) -> bool:
-    """True if derivatives of this many members begin in a handler, with their motion run once more."""
+    """True if derivatives of this many members start in a handler, which recomputes their motion."""
     return begins_in_handler(flow, members) and flow.projection is None and flow.kernel.rounds_of_rerun > 0
 
 
 def run_by_handler(flow: Flow, tolerances: Tolerances, host: Callable, shapes, ts, y0, params) -> tuple:
-    """The run of N members, `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P), N not too many for one thread.
+    """The run of N members, `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P), N few enough for one thread.
 
-    `host(ts, y0, params, *begun)` continues what the handler leaves undone (`_native.Begun`); its results, of these
-    `shapes`, are those of the whole.
+    `host(ts, y0, params, *begun)` completes a run that the handler leaves unfinished (`_native.Begun`); its results, of
+    these `shapes`, are those of the whole run.
     """
     _register_target()
     members, states = y0.shape
@@ -66,10 +66,10 @@ def run_by_handler(flow: Flow, tolerances: Tolerances, host: Callable, shapes, t
 
 
 def derivative_by_handler(kind: str, flow: Flow, tolerances: Tolerances, rows: tuple) -> tuple:
-    """The derivative "jvp" or "vjp" of the motions of N members, not too many for one thread.
+    """The derivative "jvp" or "vjp" of the motions of N members, few enough for one thread.
 
-    `rows` are the arguments of its handler (`_native.derivative_handler`). Then come `excess` (N,); whether it is done,
-    () of bool; and what must live as long as the compiled program.
+    `rows` are the arguments of its handler (`_native.derivative_handler`). The results are followed by `excess` (N,), a
+    flag () that it is done, and objects that must live as long as the compiled program.
     """
     _register_target()
     ts, y0, *_, start = rows

@@ -1,11 +1,11 @@
-"""Events and crossings of one member under every transformation of JAX: where they are, and how they vary.
+"""Events and crossings of one member under every transformation of JAX: their times and states, and derivatives.
 
     located   by machine code that watches guards along the steps, without derivatives
-    varied    by one more run, without guards, whose outputs are at the times that were located: the states there vary
-              as at any output time, and with them the times (`_surfaces.crossing_variation`)
+    varied    by a second run, without guards, with outputs at the located times: the states there have derivatives like
+              those at any output time, and with them the times (`_surfaces.crossing_variation`)
 
-The second run is only for derivatives. Its outputs lie some roundings before the crossings: where a force jumps on the
-surface itself, the state, its rate and its derivatives are then all those before the jump, and agree.
+The second run is needed for derivatives only. Its outputs are a few roundings before the crossings: if a force jumps on
+the surface itself, the state, its rate and its derivatives are all those before the jump, and consistent.
 """
 
 import functools
@@ -22,14 +22,14 @@ from lagjax._engine.taylor._flow import Flow, Tolerances
 from lagjax._engine.taylor._surfaces import Surfaces, crossing_variation, jumps_through_zero, require_one_number
 from lagjax._equations import Derivation
 from lagjax._interface import ENDED_WELL, EVENT_OCCURRED, halves
-from lagjax._primitives import attach_derivative, differentiable_where, lost_unless
+from lagjax._primitives import attach_derivative, differentiable_where, undefined_unless
 from lagjax._program import Unlowerable
 
 _BEFORE = 64 * np.finfo(np.float64).eps  # of the largest time: more than the rounding of a time, and of a border's
 
 
 class Noted(NamedTuple):
-    """The crossings of each of G surfaces, `room` at most, NaN beyond the last one."""
+    """The crossings of each of G surfaces, at most `room`, NaN after the last one."""
 
     t: Any  # (G, room)
     y: Any  # (G, room, 2n), the state then
@@ -37,7 +37,7 @@ class Noted(NamedTuple):
 
     @classmethod
     def read(cls, path, surfaces: int) -> "Noted":
-        """The crossings in the `path` of a motion that notes them, (G (room + 1), 2n + 1)."""
+        """The crossings in the `path` of a motion that records them, (G (room + 1), 2n + 1)."""
         rows = path.reshape(surfaces, -1, path.shape[-1])
         return cls(rows[:, :-1, 0], rows[:, :-1, 1:], rows[:, -1, 0])
 
@@ -46,7 +46,7 @@ class Noted(NamedTuple):
 
 
 def surfaces_of_event(problem: Problem) -> Surfaces:
-    """The functions of an event as surfaces. Raises `Unlowerable` where they are not for machine code."""
+    """The functions of an event as surfaces. Raises `Unlowerable` if machine code cannot evaluate them."""
     if "surfaces" not in problem.made:
         problem.made["surfaces"] = _surfaces_of_event(problem)
     return problem.made["surfaces"]
@@ -69,9 +69,9 @@ def _surfaces_of_event(problem: Problem) -> Surfaces:
 
 
 def surfaces_of(problem: Problem, functions: tuple, directions: tuple[int, ...], what: str) -> Surfaces:
-    """Functions of (q, qdot), and of t and params, as surfaces. Raises `Unlowerable` where machine code has none.
+    """Functions of (q, qdot), and of t and params, as surfaces. Raises `Unlowerable` if they have no machine code.
 
-    And `TypeError` where one of them is not one real number; `what` it is.
+    Raises `TypeError` if the value of one is not one real number; `what` names it.
     """
     code, structure = jax.tree.flatten(eqx.filter(problem.params, eqx.is_array_like, inverse=True))
     given = directions, tuple(code), structure, what, problem.is_rounded
@@ -107,7 +107,7 @@ def motion_to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: T
     path, y_end, t_end = attach_derivative(run_again, values, ts, y0, params, solution.t_end, *where)
     well = jnp.isin(solution.result, jnp.asarray(ENDED_WELL))
     return solution._replace(
-        path=lost_unless(reached[:, None], path, (ts, y0, params)),
+        path=undefined_unless(reached[:, None], path, (ts, y0, params)),
         y_end=differentiable_where(well, y_end),
         t_end=differentiable_where(well, t_end),
     )
@@ -115,7 +115,7 @@ def motion_to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: T
 
 @functools.lru_cache(maxsize=64)
 def _event_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
-    """`(ts, y0, params, t_end, result, event)` → path, y_end, t_end, for the sake of their derivatives."""
+    """A function `(ts, y0, params, t_end, result, event)` → path, y_end, t_end, which carries their derivatives."""
     move_to_zero = crossing_variation(surfaces)
 
     @jax.jit
@@ -139,12 +139,12 @@ def _event_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
 def run_stretch(
     flow: Flow, surfaces: Surfaces | None, tolerances: Tolerances, ts, y0, params, t_end, y_end, k, crosses
 ) -> tuple:
-    """The path, the end, and the state there, of a motion from ts[0] to `t_end`, where surface k `crosses` or none.
+    """The path, the end time, and the state there, of a motion from ts[0] to `t_end`; surface k `crosses` there.
 
-    The run goes to the rounded time of the event, and its state there is the one whose crossing varies: so the rates of
-    short motions between late events cancel to the last digit. And where nothing depends on the time, a start that
-    varies takes the motion with it: how long motions last varies by what they are, not by when they are.
-    To a surface that jumps through zero the run goes not quite: the acceleration may jump there.
+    The run ends at the rounded time of the event, and the crossing is varied from its state there: so the rates of
+    short motions between late events cancel to the last digit. And if nothing depends on the time, a varied start time
+    shifts the motion: durations depend on the motion, not on its start time. For a surface that jumps through zero the
+    run ends just before it: the acceleration may jump there.
     """
     still = jax.lax.stop_gradient
     if surfaces is not None and surfaces.borders is not None:
@@ -171,12 +171,14 @@ def motion_with_crossings(
     run_again = _crossings_variation(flow, surfaces, tolerances._replace(notes=0))
     t, y = attach_derivative(run_again, (noted.t, noted.y), ts, y0, params, noted.t)
     there, inputs = jnp.isfinite(noted.t), (ts, y0, params)
-    return solution, Noted(lost_unless(there, t, inputs), lost_unless(there[..., None], y, inputs), noted.count)
+    return solution, Noted(
+        undefined_unless(there, t, inputs), undefined_unless(there[..., None], y, inputs), noted.count
+    )
 
 
 @functools.lru_cache(maxsize=64)
 def _crossings_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
-    """`(ts, y0, params, t)` → t (G, room) and y (G, room, 2n), for the sake of their derivatives."""
+    """A function `(ts, y0, params, t)` → t (G, room), y (G, room, 2n), which carries their derivatives."""
     move_to_zero, each = crossing_variation(surfaces), np.arange(len(surfaces.directions))
 
     @jax.jit
@@ -194,7 +196,7 @@ def _crossings_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances)
 
 
 def _shortly_before(ts, t):
-    """A few roundings earlier than t, but not before the first time."""
+    """The time a few roundings before t, but not before the first time."""
     first, last = jax.lax.stop_gradient((ts[0], ts[-1]))
     step = _BEFORE * jnp.maximum(abs(first), abs(last))
     earlier = t - jnp.sign(last - first) * step

@@ -1,8 +1,8 @@
 """First derivatives of a flow map, for rows of members: `jvp` along directions, `vjp` from cotangents.
 
-Both go over the steps of the motion itself, which is run once more for them: forward along each direction
-(`_native.motions._tangent`), back with each step transposed (`_native.motions._adjoint`). They are transposes of each
-other to round-off, and as accurate as the motion as long as its steps suit its tangents: where they do not, they are
+Both replay the steps of the motion, which is run once more to record them: forward along each direction
+(`_native.motions._tangent`), backward with each step transposed (`_native.motions._adjoint`). They are transposes of
+each other to round-off, and as accurate as the motion if its steps are accurate for its tangents: if not, the steps are
 divided (`_divide_steps`). The cost of `vjp` does not grow with the number of parameters. A name that ends in `_ct` is a
 cotangent, one that ends in `_dot` a tangent.
 """
@@ -31,7 +31,7 @@ MOST_PROBES = 16  # directions along which steps that go past a border without a
 
 
 class Motions(NamedTuple):
-    """Runs of a flow, of which derivatives are taken: what went in, and the results that say how far they came."""
+    """Runs of a flow to be differentiated: their inputs, and the results that tell how far they came."""
 
     ts: Any  # (1 or N, T)
     y0: Any  # (N, 2n)
@@ -46,16 +46,16 @@ class Motions(NamedTuple):
         return cls(ts, y0, params, solution.path, solution.result, solution.accepted, solution.rejected)
 
     def take(self, rows: np.ndarray) -> "Motions":
-        """The members `rows` (R,); an array (1, …) that all share stays."""
+        """The members `rows` (R,); arrays with one row, shared by all, are kept."""
         shared = [len(x) == 1 and name in ("ts", "params") for name, x in self._asdict().items()]
         return Motions(*(x if alike else x[rows] for x, alike in zip(self, shared, strict=True)))
 
 
 def jvp(flow: Flow, motions: Motions, dy0, dparams, tolerances: Tolerances) -> tuple[np.ndarray, np.ndarray]:
-    """The derivative of `Flow.run` along m directions for each of N members, between fixed times.
+    """The derivative of `Flow.run` along m directions for each of N members, at fixed times.
 
-    `dy0` (N, m, 2n), `dparams` (N, m, P) → δpath (N, m, T, 2n), NaN where the motion did not come, and δy_end
-    (N, m, 2n), NaN where it failed.
+    `dy0` (N, m, 2n), `dparams` (N, m, P) → δpath (N, m, T, 2n), NaN at times that the motion did not reach, and δy_end
+    (N, m, 2n), NaN if it failed.
     """
     ts, y0, params, path, result, *_ = motions
     members, m = dy0.shape[:2]
@@ -81,25 +81,25 @@ def jvp(flow: Flow, motions: Motions, dy0, dparams, tolerances: Tolerances) -> t
 
 
 def scale_directions(dy0, dparams, library: Any = np) -> tuple:
-    """Directions in units of their largest numbers, for which tolerances mean the same; and these units, (…, 1)."""
+    """Directions scaled to a largest entry of 1, as tolerances require, and the scales (…, 1)."""
     length = library.abs(library.concatenate([dy0, dparams], axis=-1)).max(axis=-1, initial=0.0, keepdims=True)
     unit = library.where(length > 0, length, 1.0)
     return dy0 / unit, dparams / unit, unit
 
 
 def start_outputs(ts, dy0, path_dot, library: Any = np):
-    """The tangents of outputs (N, m, T, 2n), those of the start where an output is the start itself."""
+    """The tangents of outputs (N, m, T, 2n), with those of the start at outputs that are the start."""
     return library.where((ts == ts[:, :1])[:, None, :, None], dy0[:, :, None], path_dot)
 
 
 def _direction_group_count(members: int, m: int) -> int:
-    """The number of rows that share the m directions of a member: of few members, one or more a thread."""
+    """The number of rows into which the m directions of a member are split: for few members, one per thread or more."""
     lanes = _native.lanes()
     return max(1, min(_native.cores() // members, math.ceil(m / lanes))) if members < lanes else 1
 
 
 def _jvp_over_steps(flow: Flow, motions: Motions, dots, tolerances) -> tuple[np.ndarray, np.ndarray]:
-    """`jvp` of some directions a row, over the steps that were taken."""
+    """As `jvp`, for a group of directions per row, over recorded steps."""
     dy0, dparams = dots
     y_dot = np.array(dy0, np.float64)
     path_dot = np.full((*dy0.shape[:2], *motions.path.shape[1:]), np.nan)
@@ -123,11 +123,11 @@ def _jvp_over_steps(flow: Flow, motions: Motions, dots, tolerances) -> tuple[np.
 
 
 def vjp(flow: Flow, motions: Motions, path_ct, end_ct, tolerances: Tolerances) -> tuple[np.ndarray, np.ndarray]:
-    """The transpose of `jvp`: from m cotangents of the outputs of each of N motions to those of what went in.
+    """The transpose of `jvp`: from m cotangents of the outputs of each of N motions to those of the inputs.
 
-    `path_ct` (N, m, T, 2n) and `end_ct` (N, m, 2n) → cotangents of `y0` (N, m, 2n) and of `params` (N, m, P). A
-    cotangent that is not zero, of an output that was not reached or of the end of a motion that failed, makes all of
-    them NaN: there is no derivative.
+    `path_ct` (N, m, T, 2n) and `end_ct` (N, m, 2n) → cotangents of `y0` (N, m, 2n) and of `params` (N, m, P). A nonzero
+    cotangent of an output that was not reached, or of the end of a motion that failed, makes all of them NaN: there is
+    no derivative.
     """
     ts, y0, params, path, *_ = motions
     members, m = end_ct.shape[:2]
@@ -154,7 +154,7 @@ def vjp(flow: Flow, motions: Motions, path_ct, end_ct, tolerances: Tolerances) -
 
 
 def mask_cotangents(motions: Motions, path_ct, end_ct, library: Any = np) -> tuple:
-    """Cotangents (N, m, T, 2n), zero where an output was not reached; and whether one is lost there, (N, m)."""
+    """Cotangents (N, m, T, 2n), zero at outputs that were not reached; and flags (N, m): a nonzero one was dropped."""
     reached, failed = library.isfinite(motions.path)[:, None], (motions.result != SUCCESSFUL)[:, None]
     lost = ((path_ct != 0) & ~reached).any(axis=(2, 3)) | ((end_ct != 0).any(axis=2) & failed)
     is_last = np.arange(path_ct.shape[2])[:, None] == path_ct.shape[2] - 1
@@ -162,9 +162,9 @@ def mask_cotangents(motions: Motions, path_ct, end_ct, library: Any = np) -> tup
 
 
 def transpose_outputs(go_back: Callable, ts, path_ct, end_ct, library: Any = np) -> tuple:
-    """The cotangents of starts, and what else `go_back(path_ct, end_ct)` gives, from those of outputs and ends.
+    """The cotangents of starts from those of outputs and ends, and further results of `go_back(path_ct, end_ct)`.
 
-    `go_back` takes the outputs between: the last one is the end of the motion, and some may be its start.
+    `go_back` takes the outputs in between: the last one is the end of the motion, and some may be its start.
     """
     y_ct, *more = go_back(path_ct, end_ct + path_ct[:, -1])
     at_start = (ts == ts[:, :1])[:, :-1, None]
@@ -172,7 +172,7 @@ def transpose_outputs(go_back: Callable, ts, path_ct, end_ct, library: Any = np)
 
 
 def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -> tuple[np.ndarray, np.ndarray]:
-    """`vjp` of one cotangent a row, over the steps that were taken."""
+    """As `vjp`, for one cotangent per row, over recorded steps."""
     y_ct, params_ct = np.full(end_ct.shape, np.nan), np.full((len(end_ct), flow.numbers), np.nan)
     inputs = flow.states + flow.numbers
     directions = np.random.default_rng(0).normal(size=(1, inputs))
@@ -186,10 +186,10 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
         return excess / tolerances.largest_excess
 
     def probe(steps: Steps):
-        """The size of the last terms of the series of a tangent, in units of the limit, along any direction at all.
+        """The size of the last terms of a tangent's series along a random direction, in units of the limit.
 
-        But not by what there is no derivative by: a tangent that is NaN tells nothing, and is none to go by. Past a
-        passage tangents fall by much along one direction, and not along others: there they are followed along several.
+        Inputs without a derivative are left out, since a NaN tangent gives no information. After a passage tangents
+        fall strongly along one direction and not along others: there several are followed.
         """
         of = motions.take(steps.rows)
         found = np.isfinite(np.concatenate([y_ct[steps.rows], params_ct[steps.rows]], axis=1))
@@ -208,7 +208,7 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
 
 
 def _vjp_by_jacobian(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -> tuple[np.ndarray, np.ndarray]:
-    """`vjp` from the whole Jacobian: for more cotangents than there are numbers that vary, and where a flow turns."""
+    """As `vjp`, from the whole Jacobian: for more cotangents than inputs, and for a flow that `turns`."""
     inputs = flow.states + flow.numbers
     unit = np.broadcast_to(np.eye(inputs), (len(end_ct), inputs, inputs))
     path, end = jvp(flow, motions, unit[..., : flow.states], unit[..., flow.states :], tolerances)
@@ -228,13 +228,13 @@ def _vjp_by_jacobian(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) 
 
 
 def project_start_tangents(projection: Projection, t, y0, params, dy0, dparams) -> np.ndarray:
-    """The tangents (N, m, 2n) of the projection of the starts."""
+    """The tangents (N, m, 2n) of the projected starts."""
     start = y0[:, None], t[:, None], params[:, None]
     return _differentiate_projection(pushforward, projection, *start, dy0, dparams)
 
 
 def _inner_states(motions: Motions) -> tuple:
-    """The states at the inner output times, the start where one was not reached; these times; the parameters."""
+    """The states at the inner output times (the start if one was not reached), these times, and the parameters."""
     path = np.where(np.isfinite(motions.path), motions.path, motions.path[:, :1])
     return path[:, None, 1:-1], motions.ts[:, None, 1:-1, None], motions.params[:, None, None]
 
@@ -250,7 +250,7 @@ def _differentiate_projection(differentiate: Callable, projection: Projection, *
 
 @functools.lru_cache(maxsize=64)
 def _projection_line(differentiate: Callable, program: Program, t: int) -> Line:
-    """The derivative of a projection, from its inputs and what moves; by all of these but the time, input `t`."""
+    """The derivative of a projection by all inputs except the time, input `t`, as a line."""
     by = [i for i in range(program.size) if i != t]
     line = differentiate(program.line, [np.dtype(float)] * program.size, by, range(t))
     size = program.size + (len(by) if differentiate is pushforward else t)
@@ -263,10 +263,10 @@ def _projection_line(differentiate: Callable, program: Program, t: int) -> Line:
 def _differentiate_steps(
     flow: Flow, motions: Motions, tolerances: Tolerances, go: Callable, probe: Callable
 ) -> Iterator[int]:
-    """Call `go(steps)`, which differentiates over steps, for all rows; yield the rows without suitable steps.
+    """Call `go(steps)`, which differentiates over steps, for all rows; yield the rows without accurate steps.
 
-    `go` and `probe` return how large the last terms of the series are, (R,), in units of the limit. `go` may bound that
-    from above; where `probe` is larger than 1, the steps are divided until they suit.
+    `go` and `probe` return the size of the last terms of the series, (R,), in units of the limit. That of `go` may be
+    an upper bound; if `probe` exceeds 1, the steps are divided until they are accurate.
     """
     for steps in _record_steps(flow, motions, tolerances):
         limit = _last_term_limit(steps)
@@ -288,12 +288,12 @@ def _differentiate_steps(
 
 
 def _last_term_limit(steps: Steps) -> float:
-    """The largest last terms in units of the limit: beside where a root has no series, those that follow are larger."""
+    """The limit of last terms, in its own units: next to a root without a series, later terms are larger."""
     return 1 / EXCESS if has_passages(steps.kernel) else 1.0
 
 
 def _record_steps(flow: Flow, motions: Motions, tolerances: Tolerances) -> Iterator[Steps]:
-    """The steps of all rows, which are run once more, a portion after the other.
+    """The recorded steps of all rows, which are run once more, in portions.
 
     To keep those of the first run would save a twentieth of the time in most cases, and a fifth at most.
     """
@@ -311,11 +311,11 @@ def _record_steps(flow: Flow, motions: Motions, tolerances: Tolerances) -> Itera
 
 
 def _suitable_steps(flow: Flow, steps: Steps, params, tolerances, excess, measure: Callable) -> Steps | None:
-    """The steps of one member, each divided into ever smaller parts until it suits its tangents; None where none do.
+    """The steps of one member, divided until they are accurate for its tangents; None if that fails.
 
-    `excess` (1,), and what `measure(steps)` returns, is how large the last terms of the series are, in units of the
-    limit; of each step the record says it. Those of a motion with constraints that do not fall as its steps do are
-    rounding, as beside a dead centre: its own steps are right.
+    `excess` (1,), and the result of `measure(steps)`, is the size of the last terms of the series, in units of the
+    limit; the record has it for each step. If it does not fall as the steps of a constrained motion do, it is rounding,
+    as near a dead centre: then its own steps are right.
     """
     divided, found = steps, []
     for _ in range(TRIES):
@@ -333,7 +333,7 @@ def _suitable_steps(flow: Flow, steps: Steps, params, tolerances, excess, measur
 
 
 def _divide_steps(flow: Flow, steps: Steps, params, tolerances: Tolerances) -> Steps:
-    """The steps of one member, those that are too long in parts; others stay as they are."""
+    """The steps of one member, with those that are too long divided."""
     ((_, rows),) = steps.split_members()
     excess = rows[:, 3] / (_last_term_limit(steps) * tolerances.largest_excess)
     long = np.where(excess > 1.0, excess, 0.0) ** (1 / (steps.order - 1))
@@ -342,7 +342,7 @@ def _divide_steps(flow: Flow, steps: Steps, params, tolerances: Tolerances) -> S
 
 
 def portions(places: np.ndarray, numbers: np.ndarray, largest: int) -> list[np.ndarray]:
-    """The places in portions that need no more than `largest` numbers together, or just one place."""
+    """The indices `places` in portions that need at most `largest` numbers together, or a single index."""
     if not len(places):
         return []
     portion = np.cumsum(numbers[places]) // largest

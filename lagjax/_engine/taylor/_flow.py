@@ -1,6 +1,6 @@
 """`Flow`: the flow map of a scalar program in machine code, (output times, initial state, params) → states.
 
-Everything here works on NumPy arrays with one row a member; `_derivatives` has its derivatives, `_primitives` makes
+Everything here works on NumPy arrays with one row per member; `_derivatives` has its derivatives, `_primitives` makes
 functions of both that JAX can transform.
 """
 
@@ -34,10 +34,10 @@ _GIVEN_UP = (_SINGULAR, _NOT_FINITE, _SHRANK, _NOT_PROJECTED)  # what another va
 
 
 class Tolerances(NamedTuple):
-    """The local error of a step, what a run may cost, and how often each guard may be noted on the way.
+    """The local error tolerances, the budget of a run, and the room for notes of each guard.
 
-    An atol of 0 stands for none given: it follows the size of the motion. Derivatives need not suit the steps of a
-    motion better than those of an rtol that is `slack` times as large. An order of 0 is that which suits rtol.
+    An atol of 0 means none given: it follows the size of the motion. Steps need to be accurate for derivatives only to
+    `slack` times rtol. An order of 0 means that which suits rtol.
     """
 
     rtol: float
@@ -50,12 +50,12 @@ class Tolerances(NamedTuple):
 
     @property
     def largest_excess(self) -> float:
-        """The last terms that the series of a tangent may have along a step, relative to the tangent."""
+        """The largest allowed last terms of the series of a tangent along a step, relative to the tangent."""
         return EXCESS * self.slack * self.rtol
 
     @property
     def tighter(self) -> "Tolerances":
-        """Slightly tighter tolerances for another try, whose steps end at other places."""
+        """Slightly tighter tolerances for a retry, whose steps end at other places."""
         return self._replace(rtol=0.7 * self.rtol, atol=0.7 * self.atol, tries=self.tries - 1)
 
     @property
@@ -69,7 +69,7 @@ class Tolerances(NamedTuple):
 
 
 def require_fit(program: Program, size: int) -> None:
-    """Raise `Unlowerable` where there is no machine code for the program of a scene."""
+    """Raise `Unlowerable` if there is no machine code for the program of a scene."""
     if program.operations > forms.LARGEST_PROGRAM:
         raise Unlowerable(
             f"its acceleration takes {program.operations} operations, more than the {forms.LARGEST_PROGRAM} whose "
@@ -84,13 +84,13 @@ def require_fit(program: Program, size: int) -> None:
 class Flow:
     """The flow of a program for q̈ with n coordinates.
 
-    `parts` gives the program, which takes q, q̇, t and then the P parameters and gives q̈ and whether the mass matrix is
-    singular, and the projection that keeps the motion on its constraints, or None. It is called when machine code is
-    first needed. `guards` end a motion early. `groups` (n,) numbers the coordinates whose errors are measured together;
-    these may be those of a motion with its tangents (`nesting`). `motion` gives the program of the motion alone, where
-    the flow's has tangents too; `general` the flow of the variant for any mass matrix: members that the regular variant
-    cannot follow start again with it. Where the flow `turns`, as a slip in space does, tangents across have poles that
-    the motion has not, and transposed steps do not see: its transpose is that of its tangents.
+    `parts` gives the program, which takes q, q̇, t and then the P parameters and gives q̈ and whether the mass matrix
+    is singular, and the projection onto the constraints, or None. It is called when machine code is first needed.
+    `guards` end a motion early. `groups` (n,) numbers the coordinates whose errors are measured together; these may be
+    those of a motion with its tangents (`nesting`). `motion` gives the program of the motion without tangents;
+    `general` the flow of the variant for any mass matrix: members that fail with the regular variant are repeated with
+    it. If the flow `turns`, as a slip in space does, tangents across it have poles that the motion has not, and
+    transposed steps do not detect them: its transpose is that of its tangents.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class Flow:
 
     @classmethod
     def from_program(cls, program: Program, size: int, projection=None, guards=None, turns=False) -> "Flow":
-        """The flow of a scene's program, with that of its general variant behind it."""
+        """The flow of a scene's program, with that of its general variant as fallback."""
 
         def general():
             try:
@@ -129,19 +129,19 @@ class Flow:
 
     @property
     def program(self) -> Program:
-        """q̈ and whether the mass matrix is singular."""
+        """The program of q̈ and the flag that the mass matrix is singular."""
         return self._parts()[0]
 
     @property
     def projection(self) -> _native.Projection | None:
-        """The way back to the constraints, where there are some."""
+        """The projection onto the constraints, if there are any."""
         return self._parts()[1]
 
     @functools.cached_property
     def general_program(self) -> Program:
-        """The program that holds for any mass matrix, if there is one, else the flow's own.
+        """The program that is valid for any mass matrix, if there is one, else the flow's own.
 
-        That is enough where there are no constraints: all pivots are positive if and only if the mass matrix is.
+        Without constraints that is the same: all pivots are positive if and only if the mass matrix is.
         """
         if self.projection is None:
             return self.program
@@ -156,12 +156,12 @@ class Flow:
 
     @functools.cached_property
     def reads_time(self) -> bool:
-        """True if the motion, or what keeps it on its constraints, depends on the time itself."""
+        """True if the motion, or its projection, depends on the time explicitly."""
         programs = [self.general_program, *(self.projection or ())]
         return any(self.states in of.find_inputs(range(len(of.line.outputs))) for of in programs)
 
     def path_shape(self, times: int, notes: int) -> tuple[int, ...]:
-        """The shape of the `path` of a member: of states at this many output times, or of what is noted."""
+        """The shape of the `path` of a member: states at this many output times, or notes."""
         if self.guards is None or not self.guards.notes:
             return times, self.states
         return len(self.guards.directions) * (notes + 1), self.states + 1
@@ -174,10 +174,10 @@ class Flow:
     # ---- forward ----
 
     def run(self, ts, y0, params, tolerances: Tolerances, begun: _native.Begun | None = None) -> Solution:
-        """`ts` (N, T) or (1, T), `y0` (N, 2n), `params` (N, P) or (1, P) → the motions of N members.
+        """Integrate N members: `ts` (N, T) or (1, T), `y0` (N, 2n), `params` (N, P) or (1, P) → a `Solution`.
 
-        Results say what stopped a member, and not only that its steps became too small, or too many. A run that a
-        handler has `begun` is continued.
+        Result codes tell what stopped a member, beyond steps that became too small or too many. A run that a handler
+        has `begun` is resumed.
         """
         solution, _ = self.follow(ts, y0, params, tolerances, begun=begun)
         if (solution.result != SUCCESSFUL).any():
@@ -188,7 +188,7 @@ class Flow:
         return solution
 
     def follow(self, ts, y0, params, tolerances, room: int = 0, begun=None) -> tuple[Solution, list[Steps]]:
-        """`run` without a look at what stopped a member; and the steps of members that there was `room` for."""
+        """As `run`, without analysis of what stopped a member; and the recorded steps of members, up to `room`."""
         rtol, atol, max_steps, notes, order = *tolerances[:3], tolerances.notes, tolerances.order
         done = self.kernel.select_width(len(y0))(ts, y0, params, rtol, atol, max_steps, room, begun, notes, order)
         result, found = RESULT_OF_CODE[done.code], []
@@ -210,7 +210,7 @@ class Flow:
         return solution, [steps for steps in found if len(steps.rows)]
 
     def _explain_stops(self, solution: Solution, ts, params) -> Solution:
-        """The solution with what stopped the members whose steps became too small, or too many."""
+        """The solution with the reasons why members stopped whose steps became too small, or too many."""
         shrank, spent = solution.result == _SHRANK, solution.result == _SPENT
         some = np.flatnonzero(shrank | spent)
         if not some.size:
@@ -225,18 +225,18 @@ class Flow:
         return solution
 
     def _accelerations(self, params, t, y) -> np.ndarray:
-        """q̈ (N, n) at N states."""
+        """The accelerations q̈ (N, n) at N states."""
         return self.general_program.evaluate_many([*y.T, t, *params.T])[: self.size].T
 
     def _members_to_repeat(self, solution, ts, params, tolerances: Tolerances) -> "tuple[np.ndarray, Flow, Tolerances]":
-        """The members to run once more, by which flow and with which tolerances.
+        """The members to run once more, with which flow and which tolerances.
 
-        A program that assumes a regular mass matrix gives way to one that does not, which is long where a recursion in
-        L made it short: without constraints, only if that matrix seems singular. And where constraints become
-        dependent, as at a dead centre, a step must not end: rounding of q would decide on q̇, or allow no step from
-        there. The kernel takes such steps again; where that does not help, steps of other sizes all along may.
-        Where q̈ is finite and its series is not, that may overflow: the coefficients of what changes at a rate ω grow by
-        ω from order to order, and a lower order may do.
+        A program that assumes a regular mass matrix is replaced by the general one, which is long if a recursion in L
+        made it short: without constraints, only if that matrix seems singular. And where constraints become dependent,
+        as at a dead centre, a step must not end: rounding of q would decide on q̇, or allow no step from there. The
+        kernel retries such steps; if that does not help, different step sizes from the start may. If q̈ is finite and
+        its series is not, that may be overflow: coefficients of a change at a rate ω grow by ω from order to order, and
+        a lower order may help.
         """
         result = solution.result
         overflows = result == _NOT_FINITE
@@ -253,7 +253,7 @@ class Flow:
         return stuck & (tolerances.tries > 1), self, tolerances.tighter
 
     def _tangent_flow(self, directions: int) -> "Flow":
-        """The flow of q and of its derivatives along this many directions, whose δparams are numbers of it.
+        """The flow of q with its tangents along this many directions, whose δparams are further parameters.
 
         It has (1 + D) n coordinates and (1 + D) P parameters. A tangent that is zero by symmetry is as exact as the
         other coordinates in its direction, not exact relative to itself: each direction is one group.
@@ -273,5 +273,5 @@ class Flow:
 
 
 def members(chosen: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:
-    """The rows that are `chosen`, Booleans (N,), of each array; an array of one row is shared by all."""
+    """The rows where the mask `chosen` (N,) is true, of each array; an array of one row is shared by all."""
     return [x[chosen] if len(x) == len(chosen) else x for x in arrays]

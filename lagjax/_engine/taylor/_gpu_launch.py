@@ -1,8 +1,8 @@
 """A run of machine code on an NVIDIA GPU: XLA launches it itself, by the custom call that takes PTX.
 
-There is no handler, no callback and no address in the program, so that it may be exported and kept. What Python does
-after a run on a CPU - a second try of members that failed, a look at what stopped them - is not done here: a member
-that another variant of the program could follow ends with the code of the first.
+There is no handler, no callback and no address in the program, so that it can be exported and saved. What Python does
+after a run on a CPU - a retry of members that failed, an analysis of what stopped them - is not done here: a member
+that another variant of the program could integrate ends with the code of the first.
 """
 
 import math
@@ -23,7 +23,7 @@ _TARGET = "__gpu$xla.gpu.ptx"
 def run_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params) -> tuple:
     """The motions of N members, `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P): a `Solution` without `idle`.
 
-    Raises `ValueError` where the scene cannot go to a GPU, saying why.
+    Raises `ValueError`, with the reason, if the scene cannot run on a GPU.
     """
     notes = tolerances.notes
     try:
@@ -42,10 +42,10 @@ def run_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params) -> tuple:
 def transpose_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params, path_ct, end_ct) -> tuple:
     """The cotangents of `y0` (N, 2n) and of the parameters (N, P), from those of outputs and ends.
 
-    `path_ct` is (N, T, 2n), of which the first and the last output are not looked at, `end_ct` (N, 2n). Then `excess`
-    (N,), as of `Kernel.vjp`, and which are done (N,): all but those with more steps than a thread can write down.
+    `path_ct` is (N, T, 2n), whose first and last output are not read, `end_ct` (N, 2n). Then `excess` (N,), as in
+    `Kernel.vjp`, and flags (N,) of those that are done: all except those with more steps than a thread can record.
 
-    Raises `Unlowerable` where a GPU cannot go back over the steps of this scene.
+    Raises `Unlowerable` if a GPU cannot transpose the steps of this scene.
     """
     program, row = flow.kernel.gpu_programs.transpose(tolerances.rtol)
     members, threads = len(y0), math.prod(gpu.grid(gpu.TRANSPOSE, len(y0)))
@@ -70,7 +70,7 @@ def _launch_inputs(entry: gpu.Entry, ts, y0, params, flow: Flow, tolerances: Tol
 
 
 def launch(entry: gpu.Entry, program: str, members: int, arrays: dict[str, Any], shapes: list[tuple]) -> list:
-    """Launch a program for this many members on the `arrays` of its entry; its results have these shapes."""
+    """Launch a GPU program for this many members on the `arrays` of its entry; its results have these shapes."""
     blocks, threads = gpu.grid(entry, members)
     sizes = dict(grid_x=blocks, grid_y=1, grid_z=1, block_x=threads, block_y=1, block_z=1, shared_mem_bytes=0)
     attributes = {name: np.int32(size) for name, size in sizes.items()}
@@ -82,7 +82,7 @@ def launch(entry: gpu.Entry, program: str, members: int, arrays: dict[str, Any],
 
 
 def _launch_solution(path, y_end, t_end, code, steps, rejected, changes, states: bool) -> tuple:
-    """The results of the kernel as the fields of a `Solution`; NaN in the path where a member did not come."""
+    """The results of the GPU program as the fields of a `Solution`; NaN in the path at times not reached."""
     code, steps, rejected, changes = (x.astype(int) for x in (code, steps, rejected, changes))
     result = jnp.asarray(RESULT_OF_CODE)[code]
     result = jnp.where(jnp.isfinite(y_end).all(axis=1), result, NOT_FINITE_RESULT)

@@ -1,4 +1,4 @@
-"""Straight lines as functions of JAX that XLA does not compile: machine code of our own evaluates them, or NumPy.
+"""Straight lines as JAX functions that XLA does not compile: evaluated by machine code of lagjax, or by NumPy.
 
 With y = g(x) a line and D its derivative by x, there are three functions,
 
@@ -31,7 +31,7 @@ from jax.interpreters import ad, mlir
 from lagjax._engine.taylor._call import NO_HANDLER, capsule
 from lagjax._equations import forms
 from lagjax._native import LARGEST_LINE, LineCode, compilation_work, line_handler, make_once
-from lagjax._primitives import HostFunction, LinearMap, call_host, compute_on_host, is_zero, share_rows
+from lagjax._primitives import HostFunction, LinearMap, broadcast_members, call_host, compute_on_host, is_zero
 from lagjax._program import (
     Graph,
     LinearSystem,
@@ -56,7 +56,7 @@ MOST_IN_LANES = 2048  # numbers of a row, in all lanes 128 kB of the stack of a 
 
 
 def outputs(program: Program, count: int, first, numbers):
-    """The first `count` outputs (…, count) for the first inputs (…, m) and the others (…, P)."""
+    """The first `count` outputs (…, count) at inputs in two parts, `first` (…, m) and `numbers` (…, P)."""
     floats = all(dtype.kind == "f" for dtype in program.dtypes) and jnp.result_type(first) == np.dtype(float)
     if program.looks_up or not floats:
         return jnp.stack(program.compute_outputs(first, numbers)[:count], axis=-1)
@@ -64,13 +64,13 @@ def outputs(program: Program, count: int, first, numbers):
 
 
 def join_columns(*parts):
-    """The columns of arrays (…, m), side by side; what lies in front is broadcast."""
+    """Arrays (…, m) concatenated along the last axis; leading axes broadcast."""
     shape = jnp.broadcast_shapes(*(x.shape[:-1] for x in parts))
     return jnp.concatenate([jnp.broadcast_to(x, (*shape, x.shape[-1])) for x in parts], axis=-1)
 
 
 def line_of(program: Program, count: int | None = None) -> "Line":
-    """The first `count` outputs of a program, by default all; other inputs than floats are given as floats."""
+    """The first `count` outputs of a program (by default all) as a `Line`; all inputs are passed as floats."""
     return _simplified_line(program, count)
 
 
@@ -91,17 +91,17 @@ def _simplified_line(program: Program, count: int | None) -> "Line":
 
 
 class Root(NamedTuple):
-    """The outputs z of a line but its last, which is constant, as the root of r(x, z) = 0, with ∂r/∂z = A of `linear`.
+    """The outputs z of a line (except its constant last one) as the root of r(x, z) = 0, with ∂r/∂z = A of `linear`.
 
-    A dz = −dr: a derivative of r takes a third of the operations of one of the elimination. Its line takes the outputs
-    and the factors of A, which that of the values leaves, in its stead.
+    From A dz = −dr, a derivative of r takes a third of the operations of one of the elimination. Its line takes the
+    outputs and the factors of A, which the line of values returns, instead.
     """
 
     linear: LinearSystem
     residual: Callable[[], Program]
 
     def derive(self, of: "Line", differentiate: Callable, by: range, linear: int) -> StraightLine:
-        """`differentiate(line, types, by, outputs)`, `pushforward` or `pullback`, from (x, outputs, factors, v)."""
+        """The line of `differentiate`, `pushforward` or `pullback`, from (x, outputs, factors, v), by inputs `by`."""
         n, memo = of.outputs - 1, of.outputs + len(self.linear.factors)
         of_residual = differentiate(self.residual().line, [np.dtype(float)] * (of.size + n), by, range(n))
         solve = self.linear.solve()
@@ -127,17 +127,17 @@ def _inputs_of(graph: Graph, *counts: int) -> list[list[int]]:
 
 
 def _place_line(graph: Graph, line: StraightLine, inputs: list[int]) -> list[int]:
-    """The outputs of a line as nodes of a graph, where it has these inputs."""
+    """The output nodes of a line that is copied into a graph with these inputs."""
     found = copy_nodes(graph, line, inputs)
     return [found[i] for i in line.outputs]
 
 
 class Line:
-    """A straight line from `size` floats x, with the lines of its derivatives by the first `count`; by identity.
+    """A straight line of `size` floats x, with lines of its derivatives by the first `count`; compared by identity.
 
-    What a line of derivatives is linear in comes after its first `count` inputs. By the first that are `fixed` there
-    are no derivatives. Where it is the `root` of an equation, they are those of that, and a `memo` of numbers for them
-    comes after the outputs; lines of derivatives take both after x, and what is `plain` does not.
+    Arguments in which a line of derivatives is linear come after its first `count` inputs. The first `fixed` inputs
+    have no derivatives. If it is the `root` of an equation, derivatives are those of that, and a `memo` of numbers for
+    them follows the outputs; lines of derivatives take both after x, `plain` ones do not.
     """
 
     def __init__(self, line: StraightLine, size: int, count: int, fixed: int = 0, root: Root | None = None):
@@ -150,7 +150,7 @@ class Line:
 
     @property
     def width(self) -> int:
-        """The number of inputs by which there are derivatives."""
+        """The number of inputs with derivatives."""
         return self.count - self.fixed
 
     @functools.cached_property
@@ -163,7 +163,7 @@ class Line:
 
     @functools.lru_cache(maxsize=2)  # noqa: B019  # those of a few
     def code_of_jit(self, is_wide: bool, shared: tuple[int, ...] = ()) -> LineCode | None:
-        """The code for a program of XLA, which is called often; LLVM may take longer for it."""
+        """The machine code for use in XLA programs, which are called often, so that LLVM may take longer."""
         for lanes in (LANES, 1) if is_wide and self.size + len(self.line.outputs) <= MOST_IN_LANES else (1,):
             if compilation_work(self.line, lanes) <= WORK_OF_JIT:
                 return self._make_code(
@@ -179,7 +179,7 @@ class Line:
             return None
 
     def evaluate(self, *parts: np.ndarray) -> np.ndarray:
-        """Outputs (…, outputs) at inputs in parts (…, some): by NumPy until that took as long as to make code."""
+        """Outputs (…, outputs) at inputs in parts (…, some): by NumPy until machine code would have been cheaper."""
         batch = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
         parts = tuple(np.broadcast_to(part, (*batch, part.shape[-1])) for part in parts)
         rows = np.concatenate([part.reshape(math.prod(batch), part.shape[-1]) for part in parts], axis=1)
@@ -191,17 +191,17 @@ class Line:
 
     @functools.cached_property
     def forward(self) -> "Line":
-        """(x, v) ↦ D(x) v, v (width,)."""
+        """The line (x, v) ↦ D(x) v, v (width,)."""
         return self._derivative(pushforward, self.width)
 
     @functools.cached_property
     def back(self) -> "Line":
-        """(x, w) ↦ D(x)ᵀ w, w (outputs,)."""
+        """The line (x, w) ↦ D(x)ᵀ w, w (outputs,)."""
         return self._derivative(pullback, self.outputs)
 
     @functools.cached_property
     def with_derivative(self) -> "Line":
-        """(x, v) ↦ g(x), D(x) v, one behind the other."""
+        """The line (x, v) ↦ g(x), D(x) v, concatenated."""
         line, size = self.forward.plain.line, self.forward.plain.size
         graph = Graph(2 * len(line.nodes) + len(self.line.nodes) + size)
         (ids,) = _inputs_of(graph, size)
@@ -226,13 +226,13 @@ class Line:
         return found
 
     def __call__(self, *parts):
-        """g(x) of rows x (…, inputs) in parts (…, some), under every transformation of JAX."""
+        """The outputs at rows x (…, inputs), given in parts (…, some), under every transformation of JAX."""
         rank = max(x.ndim for x in parts)
         return value_p.bind(*(x.reshape((*[1] * (rank - x.ndim), *x.shape)) for x in parts), line=self)[0]
 
     @functools.lru_cache(maxsize=8)  # noqa: B019  # those of a few
     def vary_first(self, count: int) -> "Line":
-        """The line whose derivatives are by the first `count` inputs."""
+        """The line with derivatives by the first `count` inputs only."""
         return Line(self.line, self.size, count, min(self.fixed, count), self.root)
 
 
@@ -240,9 +240,9 @@ class Line:
 
 
 class _LineMap(LinearMap):
-    """The line `of(line)` of rows of arrays that stand side by side, with results of these `widths(line)` a row.
+    """A primitive that applies the line `of(line)` to rows of concatenated arrays; results have `widths(line)`.
 
-    Axes of rows broadcast: an array that all rows of an axis share has 1 there.
+    Axes of rows broadcast: an array that all rows of an axis share has length 1 there.
     """
 
     def __init__(self, name: str, of: Callable, widths: Callable, linear: int = 0, transpose: Callable | None = None):
@@ -270,7 +270,7 @@ class _LineMap(LinearMap):
         mlir.register_lowering(self, mlir.lower_fun(self._call_from_gpu, multiple_results=True), platform="cuda")
 
     def _place(self, expansion, params: dict, *arrays):
-        """Its nodes in the graph of a function that is lowered."""
+        """The nodes of the line in the graph of a function that is being lowered."""
         of, batch = self.of(params["line"]), _rows_of(arrays)
         arrays = [np.broadcast_to(expansion.real(x), (*batch, x.shape[-1])) for x in arrays]
         rows = np.concatenate([x.reshape(math.prod(batch), -1) for x in arrays], axis=1)
@@ -284,7 +284,7 @@ class _LineMap(LinearMap):
         return [found[..., begin:end] for begin, end in itertools.pairwise(ends)]
 
     def evaluate(self, *arrays, line: Line):
-        """By NumPy, or machine code, at once."""
+        """Evaluate at once, by NumPy or machine code."""
         return self._split(self.of(line).evaluate(*map(np.asarray, arrays)), line)
 
     def _lower_on_cpu(self, context, *arrays, line: Line):
@@ -302,7 +302,7 @@ class _LineMap(LinearMap):
         return call_host(functools.partial(self.evaluate, line=line), self.shape(*arrays, line=line), *arrays)
 
     def _code_for(self, arrays, of: Line) -> tuple[LineCode | None, list[int], list[int]]:
-        """The code for arrays of these shapes; which of them rows share, and the axes of these rows."""
+        """The machine code for arrays of these shapes; which of them rows share, and the axes of these rows."""
         batch = _rows_of(arrays)
         missing = [frozenset(i for i, size in enumerate(x.shape[:-1]) if size < batch[i]) for x in arrays]
         axes = sorted(frozenset.intersection(*filter(None, missing))) if any(missing) else []
@@ -355,7 +355,7 @@ class _LineMap(LinearMap):
 
 
 def _rows_of(arrays) -> tuple[int, ...]:
-    """The axes of rows of arrays, which broadcast."""
+    """The shape of the leading axes, rows, to which arrays broadcast."""
     return np.broadcast_shapes(*(x.shape[:-1] for x in arrays))
 
 
@@ -381,7 +381,7 @@ back_p = _LineMap("back", lambda line: line.back, lambda line: [line.width], 1, 
 
 
 def _evaluate_scalars(equation, known: dict) -> Callable:
-    """An operation as scalars, for rows of NumPy: what reads tables, and all that is rare."""
+    """A NumPy function for one JAX operation on rows, by scalars: for table look-ups, and rare cases."""
     avals = [x.aval for x in equation.invars]
     moving, results = [k for k in range(len(avals)) if k not in known], [x.aval for x in equation.outvars]
     ends = np.cumsum([math.prod(x.shape) for x in results])[:-1]
@@ -393,7 +393,7 @@ def _evaluate_scalars(equation, known: dict) -> Callable:
     program = lower(apply, *(jax.ShapeDtypeStruct(avals[k].shape, avals[k].dtype) for k in moving))
 
     def evaluate(*arrays):
-        arrays = share_rows(*(arrays[k] for k in moving))
+        arrays = broadcast_members(*(arrays[k] for k in moving))
         columns = [column for x in arrays for column in x.reshape(len(x), -1).T]
         parts = np.split(program.evaluate_many(columns).T, ends, axis=-1)
         return [x.reshape(-1, *of.shape).astype(of.dtype) for x, of in zip(parts, results, strict=True)]

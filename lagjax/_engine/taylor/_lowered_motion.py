@@ -1,4 +1,4 @@
-"""A scene in JAX whose quantities, and all their derivatives, are those of its scalar programs.
+"""A `Motion` in JAX whose quantities, and all their derivatives, are evaluated by the scene's scalar programs.
 
 JAX would differentiate L twice more for a derivative of the accelerations, and XLA compile the whole. A program is
 differentiated on its graph instead (`_line_functions`), and XLA compiles a call.
@@ -19,9 +19,9 @@ from lagjax._tracing import Program
 
 
 def lowered_motion(derivation: Derivation) -> Motion:
-    """The motion of a scene by its programs; as the scene is written where it has none that may be differentiated.
+    """The motion of a scene by its programs; the motion as written if these cannot be differentiated.
 
-    They are lowered by the first quantity that is asked for.
+    The programs are lowered when the first quantity is evaluated.
     """
     motion = derivation.motion
     if derivation.form.is_sparse:
@@ -34,7 +34,7 @@ def lowered_motion(derivation: Derivation) -> Motion:
 
 
 def _use_programs(as_written: Callable) -> Callable:
-    """A decorator: the method is that of the scene `as_written` where its programs may not be differentiated."""
+    """A decorator: the method `as_written` is used instead if the programs cannot be differentiated."""
 
     def decorate(method: Callable) -> Callable:
         @functools.wraps(method)
@@ -80,13 +80,13 @@ class _LoweredMotion(Motion):
         return momentum @ qdot - value
 
     def unbalanced_force(self, q, qdot, qddot, t, params):
-        """M q̈ − F, by a program of its own."""
+        """The force M q̈ − F, by its own program."""
         if self.derivation.differentiates_force:
             return _program_outputs(self.derivation.unbalanced_force, q, qdot, t, params, qddot)
         return super().unbalanced_force(q, qdot, qddot, t, params)
 
     def required_force(self, q, qdot, t, params, qddot, terms=0.0):
-        """τ at an acceleration, and which constraints that violates beyond rounding."""
+        """The force τ for an acceleration, and which constraints that violates beyond rounding."""
         state, of = (q, qdot, t, params), self.derivation
         if self.constrained and of.differentiates:
             terms = jax.lax.stop_gradient(_program_outputs(of.term_program(("gamma",)), *state))
@@ -94,7 +94,7 @@ class _LoweredMotion(Motion):
 
     @_use_programs(Motion.solved_acceleration)
     def solved_acceleration(self, q, qdot, t, params):
-        """q̈, NaN where its matrix is singular, and whether that is so."""
+        """The acceleration q̈, NaN where its linear system is singular, and a flag for that."""
         try:
             program = self.derivation.accelerations.program.complete
         except Unlowerable:
@@ -109,6 +109,6 @@ def _evaluate_quantities(derivation: Derivation, q, qdot, t, params, *names: str
 
 
 def _program_outputs(program: Program, q, qdot, t, params, *more) -> Array:
-    """The outputs of a program of (q, q̇, t, numbers) and more vectors, (outputs,)."""
+    """The outputs (outputs,) of a program of (q, q̇, t, numbers) and further vectors."""
     numbers = jnp.concatenate([jnp.zeros(0, q.dtype), *(jnp.ravel(x).astype(q.dtype) for x in jax.tree.leaves(params))])
     return line_of(program)(q, qdot, jnp.reshape(t, 1).astype(q.dtype), numbers, *more)

@@ -1,8 +1,8 @@
-"""The steps of a motion in parts, as its tangents need them.
+"""Steps divided for tangents where a motion passes a root without a series.
 
-A step goes past where a root has no series, as that of max(q, 0)**1.5, on the near side of it: a force of s^1.5 over a
-time s is nothing to the motion. Its slope is one of s^0.5, and to tangents that may be much. So such a step, a
-*passage*, is taken in parts that grow in proportion from the border on.
+A step that passes a point where a root has no series, as that of max(q, 0)**1.5, uses the series of the near side: a
+force s^1.5 over a short time s is negligible for the motion. Its slope s^0.5 may matter for tangents. So such a step, a
+*passage*, is divided into parts that grow geometrically from the border.
 """
 
 import numpy as np
@@ -17,11 +17,11 @@ _ROUNDING = 64 * np.finfo(float).eps  # of the time, or of coordinates: rounding
 
 
 def has_passages(kernel: Kernel) -> bool:
-    return kernel.borders is not None and bool(kernel.borders.abrupt)
+    return kernel.borders is not None and bool(kernel.borders.root_arguments)
 
 
 def part_passages(flow: Flow, steps: Steps, params, end, tolerances: Tolerances) -> Steps:
-    """The steps of one member, its passages in parts; `end` (2n,) is the last state."""
+    """The steps of one member, with its passages divided; `end` (2n,) is the last state."""
     ((_, rows),) = steps.split_members()
     if not len(rows):  # of one that failed at once
         return steps
@@ -54,13 +54,13 @@ def _singular_arguments(steps: Steps, states, t, params, pieces) -> np.ndarray:
     """The numbers (K, S) that are zero where a root has no series, at S states of a member."""
     borders, chosen = steps.kernel.borders, steps.kernel.chosen
     assert borders is not None
-    line = eliminate_dead_code(borders.program.line, borders.abrupt)
+    line = eliminate_dead_code(borders.program.line, borders.root_arguments)
     numbers = params if chosen is None else params[list(chosen.positions)]
     return line.evaluate([*states.T, t, *np.broadcast_to(numbers, (len(t), len(numbers))).T, *pieces.T])
 
 
 def cut_steps(flow: Flow, steps: Steps, cuts: list[np.ndarray], params, tolerances: Tolerances) -> Steps:
-    """The steps of one member in parts that begin at these `cuts` of each, with outputs of the motion."""
+    """The steps of one member, divided at these fractions `cuts` of each, with states of the motion there."""
     ((_, rows),) = steps.split_members()
     of = np.repeat(np.arange(len(rows)), [len(some) for some in cuts])
     table, part = rows[of], np.concatenate(cuts)
@@ -75,6 +75,6 @@ def cut_steps(flow: Flow, steps: Steps, cuts: list[np.ndarray], params, toleranc
 
 
 def _states_at_times(flow: Flow, times, t, first, params, tolerances: Tolerances) -> np.ndarray:
-    """The states of a motion at times between, from its `first` state; `t` begins and ends with its own times."""
+    """The states of a motion at `times` in between, from its `first` state; `t` has its own times, start and end."""
     ts = np.concatenate([t[:1], times, t[-1:]])
     return flow.follow(ts[None], first[None], params[None], tolerances)[0].path[0, 1:-1]

@@ -1,23 +1,23 @@
 """Flows as functions of JAX: four primitives with their derivatives, batching and lowering.
 
-With F the map (ts, y0, params) → (path, y_end) of a flow and D its derivative by (y0, params) between fixed times,
+With F the map (ts, y0, params) → (path, y_end) of a flow and D its derivative by (y0, params) at fixed times,
 
     run         F
     jvp        D v            linear in v = (δy0, δparams)              transposed: vjp
     vjp        Dᵀ w           linear in w = (w_path, w_end)             transposed: jvp
     curvature   (∂/∂x wᵀ D) d  linear in w and in d, symmetric in d      transposed in d: itself
 
-and their derivatives close the circle, so that there are derivatives of every order in every mode:
+and their derivatives are expressed by these, so that there are derivatives of every order in every mode:
 
     d run  = jvp(v − f₀ δt₀) + f δt                  f the rate (q̇, q̈) of the state, f₀ at the start
     d jvp = jvp(dv) + D² F [v, dx]                  by the run of the tangent flow
-    d vjp = vjp(dw) + curvature(w, dx) + …          by the vjp of the tangent flow, and what moves with the times
+    d vjp = vjp(dw) + curvature(w, dx) + …          by the vjp of the tangent flow, and terms of varied times
 
 To move an output time by δt moves the output by f δt; to start later from the same state is to start from another one.
 Source: Griewank & Walther, *Evaluating Derivatives* (2008), §§3–5, for forward, reverse, and forward over reverse.
 
-Every primitive takes arrays with any batch axes in front, as many of them in each, of length one where an argument is
-shared; under `jax.vmap` it is still one call of machine code. Outside of `jit` nothing is compiled but that.
+Every primitive takes arrays with any number of batch axes first, equally many in each, of length one if an argument is
+shared; under `jax.vmap` it is still one call of machine code. Outside of `jit` nothing else is compiled.
 """
 
 import functools
@@ -63,7 +63,7 @@ from lagjax._tracing import Program
 def run(flow: Flow, tolerances: Tolerances, ts, y0, params) -> Solution:
     """The motion of one member, under every transformation of JAX; `ts` (T,), `y0` (2n,), `params` (P,).
 
-    A flow with guards has no derivatives: they would have to say how its end moves.
+    A flow with guards has no derivatives, since these would include those of its end time.
     """
     if default_platform() == "cpu":  # outside of `jit` the host computes, and nothing is compiled for a new scene
         return _bind_run(ts, y0, params, flow=flow, tolerances=tolerances)
@@ -72,9 +72,9 @@ def run(flow: Flow, tolerances: Tolerances, ts, y0, params) -> Solution:
 
 @functools.lru_cache(maxsize=64)
 def compile_once(function, *first, **settings):
-    """A function of arrays, behind what comes `first`, as one program of XLA: what the host does not compute alone.
+    """A JIT-compiled function of arrays, with the arguments `first` fixed, for what the host does not compute alone.
 
-    A derivative outside of `jit` then compiles as one, too, and not operation by operation.
+    A derivative outside of `jit` is then compiled as one program, and not operation by operation.
     """
     return jax.jit(functools.partial(function, *first, **settings))
 
@@ -88,7 +88,7 @@ _GIVEN = len(_MOTIONS)
 
 
 def _member_rows(arrays, inner, library: Any = np):
-    """Each array with one row a member, `ts` and `params` with one where that is all there is; and the batch axes."""
+    """Each array with one row per member (or one shared row, of `ts` and `params`), and the batch axes."""
     batch = _split_batch(arrays, inner)
 
     def rows(place, x, k):
@@ -114,7 +114,7 @@ def _run_on_host(ts, y0, params, *, flow, tolerances):
 
 
 def _derive_on_host(name, inner, *args, flow, tolerances, **_):
-    """`_derivatives.jvp` or `vjp`, whose last arguments have these `inner` axes."""
+    """Call `_derivatives.jvp` or `vjp`; its last arguments have these `inner` axes."""
     rows, batch = _member_rows(args, (*_MOTIONS, *inner))
     derive = getattr(_derivatives, name)
     return _restore_batch(derive(flow, Motions(*rows[:_GIVEN]), *rows[_GIVEN:], tolerances), batch)
@@ -161,7 +161,7 @@ def _curvature_shapes(*args, flow, **_):
 
 
 def _curvature_composed(ts, y0, params, path_ct, end_ct, dy0, dparams, *, flow, tolerances):
-    """`curvature` by going back over the steps of the tangent flow, with cotangents of the tangent alone."""
+    """`curvature` by the vjp of the tangent flow, with cotangents of the tangents only."""
     larger, tolerances = flow.tangent(1), tolerances.with_larger_budget
     given, length = _tangent_inputs(flow, ts, y0, params, dy0, dparams)
     solution = _bind_run(*given, flow=larger, tolerances=tolerances)
@@ -173,7 +173,7 @@ def _curvature_composed(ts, y0, params, path_ct, end_ct, dy0, dparams, *, flow, 
 
 
 def _jvp_composed(ts, y0, params, dy0, dparams, *, flow, tolerances):
-    """`jvp` along one direction, (…, 2n) and (…, P), by the run of the tangent flow, and the result of that."""
+    """`jvp` along one direction, (…, 2n) and (…, P), by a run of the tangent flow; and the result code of that."""
     given, length = _tangent_inputs(flow, ts, y0, params, dy0, dparams)
     solution = _bind_run(*given, flow=flow.tangent(1), tolerances=tolerances.with_larger_budget)
     path, end = (to_rows(y, flow.size)[..., 1, :] for y in (solution.path, solution.y_end))
@@ -181,7 +181,7 @@ def _jvp_composed(ts, y0, params, dy0, dparams, *, flow, tolerances):
 
 
 def _tangent_inputs(flow: Flow, ts, y0, params, dy0, dparams):
-    """The start of the tangent flow, for a direction of length one; and the length."""
+    """The inputs of the tangent flow for a direction scaled to length one, and the length."""
     if flow.projection is not None:
         dy0 = compile_once(_project_direction, flow)(ts[..., 0], y0, params, dy0, dparams)
     length = jnp.max(jnp.abs(dy0), axis=-1, keepdims=True)
@@ -194,7 +194,7 @@ def _tangent_inputs(flow: Flow, ts, y0, params, dy0, dparams):
 
 
 def _project_direction(flow: Flow, t, y0, params, dy0, dparams):
-    """The tangent of the projection of a start, at which a motion with constraints begins (see `_derivatives`)."""
+    """The tangent of the projected start, at which a constrained motion begins (see `_derivatives`)."""
 
     def differentiate_start(t, y, p, dy, dp):
         def start(y, p):
@@ -206,12 +206,12 @@ def _project_direction(flow: Flow, t, y0, params, dy0, dparams):
 
 
 def _state_rate(flow: Flow, *state):
-    """`rate` at a state (t, y, params), compiled as one."""
+    """`rate` at a state (t, y, params), compiled as one program."""
     return compile_once(rate, flow)(*state)
 
 
 def _constant_motions(ts, y0, params, solution: Solution) -> Motions:
-    """The arguments of `jvp` and `vjp` that are those of a run and its outcome, with which their values do not vary."""
+    """The motion arguments of `jvp` and `vjp` from a run and its outcome, without derivatives of the outcome."""
     return Motions.from_solution(ts, y0, params, jax.tree.map(jax.lax.stop_gradient, solution))
 
 
@@ -240,7 +240,7 @@ def _vary_run(primals, tangents, outs, *, flow, tolerances):
 
 
 def _vary_jvp(primals, tangents, _, **settings):
-    """The change of `jvp` with ts, y0 and params."""
+    """The tangent of `jvp` due to ts, y0 and params."""
     dy0, dparams = primals[_GIVEN:]
 
     def compose_jvp(*moving):
@@ -251,7 +251,7 @@ def _vary_jvp(primals, tangents, _, **settings):
 
 
 def _vary_vjp(primals, tangents, outs, **settings):
-    """The change of `vjp` with ts, y0 and params, for each of its m cotangents."""
+    """The tangent of `vjp` due to ts, y0 and params, for each of its m cotangents."""
     (ts, y0, params), cts, dts = primals[:3], primals[_GIVEN:], tangents[0]
     dy0, dparams = map(ad.instantiate_zeros, tangents[1:3])
     total = None
@@ -265,10 +265,10 @@ def _vary_vjp(primals, tangents, outs, **settings):
 
 
 def _vjp_variation_in_time(primals, dts, outs, settings):
-    """The change of `vjp` with the output times, but for the curvature along the start's −f₀ δt₀.
+    """The tangent of `vjp` due to the output times, except the curvature along the start's −f₀ δt₀.
 
     Output i moves by f δtᵢ, so that its derivative by (y0, params) gains the part (∂f/∂y Dᵢ + ∂f/∂p) δtᵢ; and the start
-    from which the others follow has the derivative −∂f₀ δt₀.
+    of the motion has the derivative −∂f₀ δt₀.
     """
     flow, (ts, y0, params), (path_ct, end_ct) = settings["flow"], primals[:3], primals[_GIVEN:]
     path, done = primals[3], primals[4] == SUCCESSFUL
@@ -306,7 +306,7 @@ def _vary_curvature(primals, tangents, _, **settings):
 
 
 def _curvature_transpose(cotangents, *args, **settings):
-    """The transpose of `curvature`, linear in its cotangents: the second derivative along two directions."""
+    """The transpose of `curvature`, which is linear in its cotangents: the second derivative along two directions."""
     moving, given, cts, direction = map(ad.instantiate_zeros, cotangents), args[:3], args[3:5], args[5:]
     if any(map(ad.is_undefined_primal, direction)):
         second = curvature_p.bind(*given, *cts, *moving, **settings)
@@ -331,7 +331,7 @@ def _batch_rule(primitive):
 
 
 def _batch_of_batches(primitive, outputs_after):
-    """Directions, or cotangents, of one motion are followed together: `outputs_after` axes come after theirs."""
+    """The batching rule of directions or cotangents: those of one motion stay one call; results have the axis later."""
 
     def rule(args, axes, **settings):
         if any(axis is not None for axis in axes[:_GIVEN]):
@@ -372,7 +372,7 @@ for _primitive, _batching in (
 
 
 def _lowering_rule(form):
-    """The rule by which a primitive is lowered for CPUs: as `form`, which calls code that lies in this process."""
+    """The lowering of a primitive for CPUs as `form`, which calls code at an address in this process."""
     rule = mlir.lower_fun(form, multiple_results=True)
 
     def lower_form(context, *args, **settings):
@@ -385,7 +385,7 @@ def _lowering_rule(form):
 
 
 def _run_compiled(ts, y0, params, *, flow, tolerances):
-    """`run` of what XLA compiles: by the handler where that may be, else on the host."""
+    """`run` in XLA programs: by the handler if possible, else on the host."""
     settings = dict(flow=flow, tolerances=tolerances)
     shapes = _run_shapes(ts, y0, params, **settings)
     rows, batch = _member_rows((ts, y0, params), _RUN, library=jnp)
@@ -395,17 +395,17 @@ def _run_compiled(ts, y0, params, *, flow, tolerances):
         of_rows = [jax.ShapeDtypeStruct((len(rows[1]), *x.shape[len(batch) :]), x.dtype) for x in shapes]
 
         def finish_run(ts, y0, params, *begun):
-            """The outputs of a run, which Python continues from `begun`."""
+            """The outputs of a run that Python completes from `begun`."""
             return flow.run(ts, y0, params, tolerances, Begun(*begun))[:_OUTPUTS]
 
         return _restore_batch(run_by_handler(flow, tolerances, finish_run, of_rows, *rows), batch)
 
 
 def _compile_derivative(run_handler, run_on_host, shapes_of, inner, args, settings, copies: int = 1):
-    """A derivative in what XLA compiles: by a handler where the motion was a short one, else on the host.
+    """A derivative in XLA programs: by a handler if the motion is short, else on the host.
 
-    `run_handler(*rows)` gives the results for rows of members, each of which it runs in some `copies`, the sizes of
-    their last terms (`Kernel.jvp`), whether they are done, and what they need to live.
+    `run_handler(*rows)` gives the results for rows of members, each repeated in `copies`, the sizes of their last terms
+    (`Kernel.jvp`), a flag that they are done, and objects that must stay alive.
     """
     shapes, function = shapes_of(*args, **settings), functools.partial(run_on_host, **settings)
     (ts, y0, params, _, _, *counts, a, b), batch = _member_rows(args, (*_MOTIONS, *inner), library=jnp)
@@ -437,7 +437,7 @@ def _jvp_compiled(*args, **settings):
 
 
 def _vjp_compiled(*args, **settings):
-    """`vjp` of what XLA compiles: of several cotangents each is that of a copy of its member."""
+    """`vjp` in XLA programs: a member with several cotangents is copied, one for each."""
     copies = args[-1].shape[-2]
 
     def run_handler(ts, y0, params, path_ct, end_ct):
@@ -466,7 +466,7 @@ def _run_for_gpus(ts, y0, params, *, flow, tolerances, **_):
 
 
 def _jvp_for_gpus(ts, y0, params, *given, flow, tolerances):
-    """`jvp`: a member of the tangent flow for each direction, NaN where that was not followed to its end."""
+    """`jvp` on GPUs: a member of the tangent flow for each direction, NaN if that failed."""
     with jax.enable_x64(True):
         ts, y0, params = (x[..., None, :] for x in (ts, y0, params))
         path, end, result = _jvp_composed(ts, y0, params, *given[-2:], flow=flow, tolerances=tolerances)
@@ -474,7 +474,7 @@ def _jvp_for_gpus(ts, y0, params, *given, flow, tolerances):
 
 
 def _vjp_for_gpus(*args, flow, tolerances):
-    """Cotangents of starts and params, back over the steps; by tangents under constraints, or without a record."""
+    """`vjp` on GPUs over recorded steps; by tangents with constraints, or if there is no record."""
     settings = dict(flow=flow, tolerances=tolerances)
     with jax.enable_x64(True):
         rows, batch = _member_rows(args, (*_MOTIONS, 3, 2), library=jnp)
@@ -498,9 +498,9 @@ def _vjp_for_gpus(*args, flow, tolerances):
 
 
 def _go_back_on_gpu(motions: Motions, path_ct, end_ct, *, flow, tolerances):
-    """The cotangents of starts and parameters, a row for each of m cotangents of a member, and whether a row is right.
+    """The cotangents of starts and parameters, one row per cotangent of a member, and a flag that a row is right.
 
-    None where the GPU cannot compute them.
+    None if the GPU cannot compute them.
     """
     if has_passages(flow.kernel):
         return None
@@ -516,7 +516,7 @@ def _go_back_on_gpu(motions: Motions, path_ct, end_ct, *, flow, tolerances):
 
 
 def _vjp_by_tangents(ts, y0, params, *given, flow, tolerances):
-    """`vjp`: the derivative along every number of the start and the parameters, times the cotangents."""
+    """`vjp` by the derivative along every number of the start and the parameters, times the cotangents."""
     *run, path_ct, end_ct = given
     batch = _split_batch((ts, y0, params), _RUN)
     basis = jnp.broadcast_to(jnp.eye(count := flow.states + flow.numbers), (*batch, count, count))

@@ -1,8 +1,8 @@
-"""The rate of a state, with which an output moves when its time does: of a motion that slides, too.
+"""The rate of a state, which moves an output when its time varies; also for a motion that slides along a border.
 
-A program that decides anew at the state does not see that the motion slides along a border (`_program._borders`): on
-which side of it a state lies there is rounding. The motion slides where both sides push onto the border, and the state
-comes to it within an instant.
+Pieces decided from the state alone do not show that the motion slides along a border (`_program._borders`): there
+rounding decides on which side a state lies. The motion slides if both sides push onto the border, and the state reaches
+it at once.
 """
 
 from typing import Any
@@ -19,7 +19,7 @@ INSTANT = 1e-9  # of the time; what a border is off by while a motion slides alo
 
 
 def rate(flow: Flow, t, y, params):
-    """(q̇, q̈) at states y (…, 2n), t (…), params (…, P); zero where it is not finite: there the motion has ended."""
+    """The rates (q̇, q̈) at states y (…, 2n), t (…), params (…, P); zero where not finite: the motion has ended."""
     n, borders, program = flow.size, flow.kernel.borders, flow.general_program
     rows = Rows(join_columns(y, t[..., None]), params)
     if borders is not None and any(guard.slide >= 0 for guard in borders.guards):
@@ -34,7 +34,7 @@ def rate(flow: Flow, t, y, params):
 
 
 def _evaluate_pieces(borders, rows: Rows, pieces) -> tuple[tuple, tuple]:
-    """The outputs of the program on these pieces, and the switching numbers."""
+    """The outputs of the program on these pieces, and its switching numbers."""
     line = borders.program.line
     count = len(line.outputs)
     values = emit_rows(line.replace(outputs=(*line.outputs, *borders.switches)), rows._replace(pieces=pieces))
@@ -42,7 +42,7 @@ def _evaluate_pieces(borders, rows: Rows, pieces) -> tuple[tuple, tuple]:
 
 
 def _pieces_at_state(borders, rows: Rows, n: int) -> list[Any]:
-    """The pieces at a state; 1 for those that say that the motion slides."""
+    """The pieces at a state; 1 for a flag that the motion slides."""
     count, zero = len(borders.switches), jnp.zeros_like(rows.first[..., 0])
     pieces = list(emit_rows(borders.decide, rows._replace(pieces=[zero] * (2 * count))))
     # Along a border in position a motion slides at rest, which `decide` knows, and so it rests on a cone.
@@ -58,7 +58,7 @@ def _pieces_at_state(borders, rows: Rows, n: int) -> list[Any]:
         sides[guard.slide] = (j, *(jnp.where(found[0] < known[0], x, y) for x, y in zip(found, known, strict=True)))
 
     def rates(side: int):
-        """The rates of the switching numbers, where all pieces that may slide are on one side of their border."""
+        """The rates of the switching numbers with all pieces that may slide on one side of their border."""
         there = list(pieces)
         for slide, (j, _, *of_sides) in sides.items():
             there[slide], there[j] = zero, lax.stop_gradient(of_sides[side])

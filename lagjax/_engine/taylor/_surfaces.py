@@ -1,21 +1,22 @@
-"""Surfaces that a motion meets: guards as programs, and how the time and the state of a crossing vary.
+"""Surfaces as guards of machine code, and derivatives of the time and state of a crossing.
 
-Where a guard vanishes is found by machine code, without derivatives (`_native.steps._events`). Those of the crossing
-come from the implicit function: with g the guard and ġ its rate along the motion,
+Machine code finds the zeros of guards without derivatives (`_native.steps._events`). Those of the crossing follow from
+the implicit function theorem: with g the guard and ġ its rate along the motion,
 
     dt* = −dg / ġ        dy* = dy + ẏ dt*
 
-and the same to second order (`crossing_variation`).
+and likewise to second order (`crossing_variation`).
 """
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine.taylor._line_functions import outputs
 from lagjax._equations import Derivation, forms
@@ -24,17 +25,15 @@ from lagjax._primitives import differentiable_where
 from lagjax._program import StraightLine, Unlowerable, borders, copy_nodes, distances, tangents_in
 from lagjax._tracing import Program, Scalars, absolute, compose, fold, lower, lower_scalars, stack
 
-PyTree = Any
-
 
 class Surfaces(NamedTuple):
-    """Guards as programs of (q, q̇, t, params), and how each has to change sign: −1, 0, +1.
+    """Guards as programs of (q, q̇, t, params), and the direction of a sign change that counts: −1, 0, +1.
 
-    `values` gives all g. `complete` gives what `_native.Guards` wants: g, then ġ, then the sizes of both, which bound
-    their round-off; and for a start that `is_rounded` to float32, unless the motion remembers it, that of the start.
-    `borders` gives how far every number by which a guard is pieced together is from its border, and `followed()` all g
-    and these distances, how fast both change along the motion, and (q̇, q̈). What `holds` ends a motion at once that
-    begins beyond it, in its direction.
+    `values` gives all g. `complete` gives the outputs that `_native.Guards` needs: g, then ġ, then the sizes of both,
+    which bound their round-off; and for a start that `is_rounded` to float32, unless the motion remembers it, its
+    rounding error. `borders` gives the distance of every switching number of a guard from its border, and `followed()`
+    all g and these distances, the rates of both along the motion, and (q̇, q̈). A guard that `holds` ends at once a
+    motion that starts beyond it, in its direction.
     """
 
     values: Program
@@ -46,7 +45,7 @@ class Surfaces(NamedTuple):
     holds: tuple[bool, ...] = ()
 
     def guards(self, notes: bool = False, remembers: bool = False) -> Guards:
-        """The surfaces as guards of machine code: a change ends the motion or, with `notes`, is written down.
+        """The surfaces as guards of machine code: a change ends the motion or, with `notes`, is recorded.
 
         A motion that `remembers` is given the side of each surface from which it comes (see `Guards`).
         """
@@ -55,7 +54,7 @@ class Surfaces(NamedTuple):
 
     @property
     def have_no_rate(self) -> np.ndarray:
-        """True for every guard, (G,), that has no rate anywhere: it changes its sign by jumps."""
+        """For every guard, (G,): True if its rate is zero everywhere, so that it changes its sign by jumps."""
         count = len(self.directions)
         return np.array([self.complete.constant(count + k) == 0.0 for k in range(count)])
 
@@ -65,8 +64,8 @@ class Surfaces(NamedTuple):
     ) -> "Surfaces":
         """The surfaces of a function of y = (q, q̇, t), (2n + 1,), and params, which gives all g (G,).
 
-        It takes the outputs of `given` as well, where there is such a program of the same numbers. `code` and
-        `structure` are what params hold that is not a number. Raises `Unlowerable`.
+        It also takes the outputs of the program `given`, if there is one. `code` and `structure` are the parts of
+        params that are not numbers. Raises `Unlowerable`.
         """
         moving, motion = 2 * derivation.layout.size + 1, derivation.accelerations.program.complete
         y, numbers = jax.ShapeDtypeStruct((moving,), derivation.layout.dtype), derivation.numbers
@@ -93,7 +92,7 @@ class Surfaces(NamedTuple):
 
 
 def _guard_rates_and_noise(values: Program, motion: Program, moving: int, rounding: Program | None) -> Program:
-    """g, ġ, the sizes of both, and what rounding of a start does to g, see `Surfaces`."""
+    """The program of g, ġ, the sizes of both, and the error of g by a rounded start, see `Surfaces`."""
 
     def scalars(expansion, arguments):
         graph, ids = expansion.graph, np.concatenate([x.ravel() for x in arguments])
@@ -115,7 +114,7 @@ def _guard_rates_and_noise(values: Program, motion: Program, moving: int, roundi
 
 
 def _guards_and_rates(values: Program, motion: Program, moving: int, pieces: StraightLine | None) -> Program:
-    """All g and the distances of their borders, how fast both change along the motion, and (q̇, q̈)."""
+    """The program of all g and border distances, their rates along the motion, and (q̇, q̈)."""
 
     def scalars(expansion, arguments):
         graph, ids = expansion.graph, np.concatenate([x.ravel() for x in arguments])
@@ -133,7 +132,7 @@ def _guards_and_rates(values: Program, motion: Program, moving: int, pieces: Str
 
 
 def _rate_of_change(motion: Program, expansion, ids: np.ndarray, moving: int) -> Scalars:
-    """The rate of (q, q̇, t) in a graph where the inputs are `ids`."""
+    """The rate of (q, q̇, t), in a graph whose inputs are `ids`."""
     outputs = motion.place(expansion, ids)[list(motion.line.outputs[: moving // 2])]
     one = expansion.constants(np.ones(1))
     return Scalars(expansion, np.concatenate([ids[moving // 2 : moving - 1], outputs, one]))
@@ -141,12 +140,12 @@ def _rate_of_change(motion: Program, expansion, ids: np.ndarray, moving: int) ->
 
 @functools.lru_cache(maxsize=64)
 def rate_errors(complete: Program, count: int) -> Program:
-    """The running errors of all ġ in units of round-off: what is left of terms that cancel is not seen in its size."""
+    """The program of the running errors of all ġ in units of round-off, which include those of cancelled terms."""
     return complete.rounding_of(range(count, 2 * count), complete.shapes[0].size)
 
 
 def _borders_of(values: Program, n: int) -> StraightLine | None:
-    """The distances of guards from the borders at which they may jump; None of smooth ones, or without a program."""
+    """The distances of guards from the borders at which they may jump; None if smooth, or without a program."""
     try:
         found = borders(values, n, slides=False, watched=len(values.line.outputs))
     except Unlowerable:
@@ -160,7 +159,7 @@ def vector_of(numbers: PyTree) -> jax.Array:
 
 
 def require_one_number(value, what: str) -> jax.Array:
-    """The value of a guard as an array. Raises `TypeError` where it is not one real number."""
+    """The value of a guard as an array. Raises `TypeError` if it is not one real number."""
     if len(jax.tree.leaves(value)) != 1 or value is not jax.tree.leaves(value)[0]:
         raise TypeError(f"{what} must return one real number; got {type(value).__name__}.")
     value = jnp.asarray(value)
@@ -170,7 +169,7 @@ def require_one_number(value, what: str) -> jax.Array:
 
 
 def crossing_variation(surfaces: Surfaces) -> Callable:
-    """`(k, taken, t, y, numbers)` → (t, y), as `move_to_zero`; where g′ is zero there are no derivatives: NaN."""
+    """A function `(k, taken, t, y, numbers)` → (t, y), as `move_to_zero`; derivatives are NaN where g′ is zero."""
 
     def move(k, taken, *at):
         crosses, *there = move_to_zero(surfaces, k, taken, at, jax.lax.stop_gradient(at))
@@ -180,16 +179,16 @@ def crossing_variation(surfaces: Surfaces) -> Callable:
 
 
 def move_to_zero(surfaces: Surfaces, k, taken, at: tuple, still: tuple) -> tuple:
-    """True if guard k crosses, and (t, y): the state `at` (t, y, numbers), moved to where the guard is zero.
+    """A flag that guard k crosses, and (t, y): the state `at` (t, y, numbers), moved to the zero of the guard.
 
-    What is `still` is the same, and does not vary. With δg the variation of the guard, f the rate of the state, and ′
+    `still` are the same numbers without derivatives. With δg the variation of the guard, f the rate of the state, and ′
     the derivative along the motion, time moves by
 
         s = −ε − ½ (g″/g′) ε²,  ε = δg/g′        and the state by   f s + ½ f′ s²,
 
     up to third order in δg, which is zero itself: first and second derivatives are right. Where it is not `taken`
-    nothing moves. Where the guard jumps through zero, δg is that of the number whose border is there: the one that is
-    nearest in time.
+    nothing moves. Where the guard jumps through zero, δg is that of the switching number at its border, the nearest in
+    time.
     """
     follow = functools.partial(_follow_guards, surfaces)
     (t, y, _), (values, rates, slope) = at, follow(*at)
@@ -216,14 +215,14 @@ def jumps_through_zero(surfaces: Surfaces, k, t, y, numbers):
 
 
 def _follow_guards(surfaces: Surfaces, t, y, numbers) -> list:
-    """The guards and the distances of their borders, how fast both change, and the rate of the state."""
+    """The guards and border distances, their rates along the motion, and the rate of the state."""
     program, n = surfaces.followed(), y.shape[0] // 2
     found = outputs(program, len(program.line.outputs), jnp.append(y, t), numbers)
     return jnp.split(found, [len(found) // 2 - n, len(found) - 2 * n])
 
 
 def _find_zero(surfaces: Surfaces, k, values, rates):
-    """The number that is zero where guard k changes: that of the guard, or of the border that is nearest in time."""
+    """The index of the number that is zero where guard k changes: the guard, or the border nearest in time."""
     number, count = np.arange(values.size), len(surfaces.directions)
     times = jnp.abs(values / rates) * np.where(number >= count, _LATER, 1.0)
     times = jnp.where(jnp.isnan(times), jnp.inf, times)

@@ -1,6 +1,6 @@
 """The program of a motion with its tangents: the variational equations.
 
-To q belong δq₁ … δq_D, derivatives along D directions (δy0, δparams), which move by
+The tangents δq₁ … δq_D of q along D directions (δy0, δparams) satisfy
 
     d²/dt² δq = ∂q̈/∂q δq + ∂q̈/∂q̇ δq̇ + ∂q̈/∂p δp.
 
@@ -25,7 +25,7 @@ def from_rows(y):
 
 
 def to_rows(y, n: int):
-    """Rows (..., rows, 2n) from the states of a tangent flow over n coordinates."""
+    """Rows (..., rows, 2n) from the states of a tangent flow with n coordinates."""
     rows = y.shape[-1] // (2 * n)
     return y.reshape(*y.shape[:-1], 2, rows, n).swapaxes(-3, -2).reshape(*y.shape[:-1], rows, 2 * n)
 
@@ -33,10 +33,10 @@ def to_rows(y, n: int):
 def tangent_programs(
     program: Program, projection: Projection | None, size: int, directions: int
 ) -> tuple[Program, Projection | None]:
-    """The program and the projection of a motion over n = `size` coordinates, and of its tangents.
+    """The program and the projection of a motion with n = `size` coordinates together with its tangents.
 
-    The arguments q, q̇ and params of the new programs have 1 + D rows: those of the motion, then one for each direction.
-    They are derived from the operations of the programs, as the steps' own derivatives are.
+    The arguments q, q̇ and params of the new programs have 1 + D rows: those of the motion, then one for each
+    direction. They are derived from the operations of the programs, as the steps' own derivatives are.
     """
     rows, numbers = 1 + directions, program.size - 2 * size - 1
     every = [None, *range(directions)]

@@ -89,15 +89,21 @@ _LAGS = 20  # of residuals that hold motion some are correlated over the first l
 _CHANCE = 4.0  # standard errors of a correlation: white residuals show it at one of this many lags in 1 of 800 fits
 
 
-def correlated_power(rows: np.ndarray, counted: np.ndarray) -> float:
-    """The mean square of the correlated part of residuals (N, T): the largest product of neighbours, to which white
-    noise adds nothing; zero where no correlation exceeds chance."""
-    count = int(counted.sum())
-    sums = lag_products(np.where(counted, rows, 0.0), counted)[: _LAGS + 1]
-    if count < 2 or not sums[0] > 0:
-        return 0.0
-    highest = np.abs(sums[1:]).max(initial=0.0)
-    return float(highest / count) if highest > _CHANCE / np.sqrt(count) * sums[0] else 0.0
+def first_lag_products(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:
+    """Σ zᵢ zᵢ₊ₖ of each row (N, T) for the first lags k, (N, K), of samples that count."""
+    rows = close_gaps(np.where(counted, rows, 0.0), counted)
+    found = np.zeros((len(rows), _LAGS + 1))
+    for k in range(min(_LAGS + 1, rows.shape[1])):
+        found[:, k] = np.sum(rows[:, k:] * rows[:, : rows.shape[1] - k], axis=1)
+    return found
+
+
+def correlated_power(sums: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """The mean square (R,) of the correlated part of residuals: the largest product of neighbours, to which white noise
+    adds nothing, of sums of products (R, K) over `count` (R,) samples; zero where no correlation exceeds chance."""
+    highest = np.abs(sums[:, 1:]).max(axis=1)
+    seen = (count > 1) & (sums[:, 0] > 0) & (highest * np.sqrt(count) > _CHANCE * sums[:, 0])
+    return np.where(seen, highest / np.maximum(count, 1), 0.0)
 
 
 def close_gaps(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:

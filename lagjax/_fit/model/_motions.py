@@ -113,8 +113,9 @@ class _MachineCodeMotions(AbstractMotions):
     def follow(self, ts, y0, numbers, y0_dot, numbers_dot, table=None):
         flow, params = self._flow(numbers, table)
         run = flow.run(ts, y0, params, self.tolerances)
-        if not y0_dot.shape[1]:
-            return RecordMotion(run.path, np.zeros((len(y0), 0, *run.path.shape[1:])), run.result, run.t_end, run.y_end)
+        if not y0_dot.shape[1] or not np.isin(run.result, ENDED_WELL).all():  # a lost motion needs no tangents
+            none = np.zeros((len(y0), 0, *run.path.shape[1:]))
+            return RecordMotion(run.path, none, run.result, run.t_end, run.y_end)
         params_dot = np.zeros((*y0_dot.shape[:2], params.shape[1]))
         params_dot[..., : numbers.shape[-1]] = numbers_dot
         tangents, _ = jvp(flow, Motions.from_solution(ts, y0, params, run), y0_dot, params_dot, self.tolerances)

@@ -194,10 +194,12 @@ class Parameters:
 
     @functools.cached_property
     def _derivative_places(self) -> tuple[np.ndarray, ...]:
-        """The places of derivatives in `directions`, (record, column, number), and which of `_slopes` each is."""
+        """The places of derivatives in `directions`, (record, column, number), and which of `_slopes` each is; those of
+        the first record where all records share their unknowns."""
         rows, columns, _ = self._slopes(self.inverse(self.first))
         found = []
-        for record, (places, own) in enumerate(zip(self.places, self.unknowns.columns, strict=True)):
+        for record in range(len(self.places) if self.unknowns.own else 1):
+            places, own = self.places[record], self.unknowns.columns[record]
             number, column = np.full(len(self.first), -1), np.full(len(self) + 1, -1)
             number[places], column[own] = np.arange(len(places)), np.arange(len(own))
             number, column = number[self.free_places[rows]], column[columns]
@@ -208,8 +210,8 @@ class Parameters:
     def directions(self, u: np.ndarray) -> np.ndarray:
         """The derivatives of the numbers of every record by the unknowns that these depend on, (R, L, P)."""
         found = np.zeros((*self.unknowns.columns.shape, self.places.shape[1]))
-        *places, which = self._derivative_places
-        found[tuple(places)] = self._slopes(u)[2][which]
+        record, column, number, which = self._derivative_places
+        found[record if self.unknowns.own else slice(None), column, number] = self._slopes(u)[2][which]
         return found
 
     def ends(self, u: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -263,8 +265,14 @@ class Parameters:
 
     def limits(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(low, high) between which one step of the search from u (F,) may lie."""
-        pairs = [part.transform.limits(u[own]) for own, _, part in self.cuts]
-        low, high = (np.concatenate([np.zeros(0), *ends]) for ends in zip(*pairs, strict=True)) if pairs else (u, u)
+        return self._join_limits([part.transform.limits(u[own]) for own, _, part in self.cuts])
+
+    def leaps(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(low, high) of the steps from u (F,) that end anywhere in the sets of numbers."""
+        return self._join_limits([part.transform.leaps(u[own]) for own, _, part in self.cuts])
+
+    def _join_limits(self, pairs: list) -> tuple[np.ndarray, np.ndarray]:
+        low, high = (np.concatenate([np.zeros(0), *(pair[k] for pair in pairs)]) for k in range(2))
         return low, high
 
     def take_step(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -409,15 +417,17 @@ class Unknowns(NamedTuple):
     def spread(self, local: np.ndarray) -> np.ndarray:
         """Rows (R, ..., L) of columns of records as rows (R, ..., F) of columns of all unknowns."""
         found: np.ndarray = np.zeros((*local.shape[:-1], self.count + 1))
-        for k, columns in enumerate(self.columns):
-            found[k][..., columns] = local[k]
+        columns = self.columns.reshape(len(local), *[1] * (local.ndim - 2), -1)
+        np.put_along_axis(found, np.broadcast_to(columns, local.shape), local, axis=-1)
         return found[..., :-1]
 
     def add(self, squares: np.ndarray) -> np.ndarray:
         """The sum (F, F) of matrices (R, L, L) of the columns of records."""
         total = np.zeros((self.count + 1, self.count + 1))
-        for columns, square in zip(self.columns, squares, strict=True):
-            total[np.ix_(columns, columns)] += square
+        if self.own:
+            np.add.at(total, (self.columns[:, :, None], self.columns[:, None]), squares)
+        elif len(squares):
+            total[np.ix_(self.shared, self.shared)] = squares.sum(axis=0)
         return total[:-1, :-1]
 
     def norms(self, lengths: np.ndarray) -> np.ndarray:
@@ -431,19 +441,24 @@ class Unknowns(NamedTuple):
 
     def stack_by_owner(self, rows: np.ndarray) -> np.ndarray:
         """The rows (R, M, C) of records that have the same numbers below each other, (O, M′, C), filled with zeros."""
-        owners, which = np.unique(self.owners, return_inverse=True)
-        counts = np.bincount(which)
-        if (counts == 1).all():
-            return rows[np.argsort(which)]
-        order = np.argsort(which, kind="stable")
-        found = np.zeros((len(owners), counts.max(), *rows.shape[1:]))
-        found[which[order], np.concatenate([np.arange(count) for count in counts])] = rows[order]
-        return found.reshape(len(owners), -1, rows.shape[-1])
+        return stack_rows(rows, np.unique(self.owners, return_inverse=True)[1])
 
     @property
     def owner_columns(self) -> np.ndarray:
         """The columns of each owner (O, own), in the order of `stack_by_owner`."""
         return self.columns[np.unique(self.owners, return_index=True)[1], : self.own]
+
+
+def stack_rows(rows: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """The rows (R, M, C) that belong to the same of O owners, `which` (R,), below each other, (O, M′, C), filled with
+    zeros."""
+    counts, order = np.bincount(which), np.argsort(which, kind="stable")
+    if (counts == 1).all():
+        return rows[order]
+    found = np.zeros((len(counts), counts.max(), *rows.shape[1:]))
+    places = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
+    found[which[order], places] = rows[order]
+    return found.reshape(len(counts), -1, rows.shape[-1])
 
 
 def _broadcast_prefix(prefix: PyTree, tree, leaves: list, name: str) -> list:

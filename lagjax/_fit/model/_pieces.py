@@ -66,6 +66,8 @@ def _stack_pieces(records: list[Record], pieces: list[Piece], rows: np.ndarray, 
         gap = 8 * eps * max(abs(times[0]), abs(times[-1]), times[-1] - times[0])
         ts[i] = np.concatenate([times, times[-1] + gap * np.arange(1, longest - count + 1)])
         values[i, :count], weights[i, :count] = np.where(weight > 0, measured, 0.0), weight
+        if not driven.shape[1]:
+            continue
         at, samples = records[record].sampled_at, matrices[record][2]
         between = samples_between(at, times[0], times[-1], hold)
         sampled.append((at[between], samples[between]))

@@ -1,5 +1,6 @@
 """Records: the measurements as the user gives them, checked; and several systems by their names."""
 
+import functools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -108,7 +109,7 @@ class Record(MeasuredSignal):
         gaps = f", {missing} values missing" if missing else ""
         return f"Record(t from {self.ts[0]:g} to {self.ts[-1]:g}, {len(self)} samples of {signals} signals{gaps})"
 
-    @property
+    @functools.cached_property
     def matrix(self) -> np.ndarray:
         """All signals side by side, (T, S); NaN where missing."""
         return np.concatenate([leaf.reshape(len(self), -1) for leaf in jax.tree.leaves(self.values)], axis=1)
@@ -117,7 +118,7 @@ class Record(MeasuredSignal):
     def sampled_at(self) -> np.ndarray:
         return self.ts if self.input_ts is None else self.input_ts
 
-    @property
+    @functools.cached_property
     def input_samples(self) -> np.ndarray:
         """All inputs side by side as they were sampled, (K, I)."""
         leaves, count = jax.tree.leaves(self.inputs), len(self.sampled_at)
@@ -132,7 +133,7 @@ class Record(MeasuredSignal):
         columns = [np.interp(ts, self.sampled_at, column) for column in samples]
         return np.reshape(columns, (len(samples), len(ts))).T
 
-    @property
+    @functools.cached_property
     def input_structure(self) -> tuple | None:
         """The key that the inputs of all records of a fit share; None without inputs."""
         leaves, tree = jax.tree.flatten(self.inputs)
@@ -148,13 +149,13 @@ class Record(MeasuredSignal):
             for index in np.ndindex(leaf.shape[1:])
         )
 
-    @property
+    @functools.cached_property
     def structure(self) -> tuple:
         """The key that all records of a fit share: the tree of the signals and their shapes."""
         leaves, tree = jax.tree.flatten(self.values)
         return tree, tuple(leaf.shape[1:] for leaf in leaves)
 
-    @property
+    @functools.cached_property
     def weight_matrix(self) -> np.ndarray:
         """The weight of every sample (T, S), zero where it is missing.
 

@@ -590,7 +590,10 @@ def qr_triangle(rows: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
-_BLOCK = 8  # times as many rows as columns in one factorisation
+_BLOCK = 8  # times as many rows as columns in one factorisation, and twice as many at least
+# Numbers in one factorisation, for which OpenBLAS takes one thread (up to 9216). Of twice as many, of 64 columns, its
+# threads wait for each other: 50 times the processor time on a busy machine.
+_BLOCK_NUMBERS = 8192
 
 
 def compress_rows(rows: np.ndarray) -> np.ndarray:
@@ -599,7 +602,8 @@ def compress_rows(rows: np.ndarray) -> np.ndarray:
     pieces, _, columns = rows.shape
     rows = rows if columns else rows[:, :0]
     while rows.shape[1] > columns:
-        height = min(_BLOCK * columns, rows.shape[1])
+        height = max(2 * columns, min(_BLOCK * columns, _BLOCK_NUMBERS // columns))
+        height = min(height, rows.shape[1])
         if missing := -rows.shape[1] % height:
             rows = np.concatenate([rows, np.zeros((pieces, missing, columns))], axis=1)
         rows = qr_triangle(rows.reshape(-1, height, columns)).reshape(pieces, -1, columns)

@@ -17,7 +17,7 @@ _KINDS, _REPEATED = 5, 3  # values that are looked at, and how often they must b
 def require_measurements(records: list[Record], names: tuple[str, ...], periods: np.ndarray) -> None:
     """Raise `ValueError` for samples that stand for missing ones: one value, to which a signal jumps and comes back."""
     for place, record in enumerate(records):
-        for k, name in enumerate(names):
+        for k, name in enumerate(names if len(record) >= _FEWEST else ()):
             column = record.matrix[record.weight_matrix[:, k] > 0, k]
             if (found := _find_placeholder(column, periods[k])) is None:
                 continue
@@ -95,7 +95,7 @@ def constant_signals(records: list[Any], names: tuple[str, ...]) -> list[str]:
         f"{name} is {there[0]:.6g} at all {len(there)} samples of records[{place}]: it does not move, or its "
         "sensor hangs."
         for place, record in enumerate(records)
-        if isinstance(record, Record)
+        if isinstance(record, Record) and len(record) >= _FEWEST
         for k, name in enumerate(names)
         if len(there := present_samples(record, k)) >= _FEWEST and np.ptp(there) == 0.0
     ]

@@ -86,6 +86,10 @@ class AbstractTransform(abc.ABC):
         """(low, high) between which one step of the search may lie, (m,) each."""
         return np.full(len(u), -self.reach), np.full(len(u), self.reach)
 
+    def leaps(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(low, high) between which a step may end anywhere in the set, (m,) each."""
+        return self.limits(u)
+
     def take_step(self, u: np.ndarray, step: np.ndarray) -> np.ndarray:
         """The end of a step (m,) from u (m,)."""
         return u + step
@@ -178,6 +182,9 @@ class Positive(AbstractSeparable):
         """The steps that lower or raise x by the factor e to the power of `reach`."""
         return np.full(len(u), np.expm1(-self.reach)), np.full(len(u), np.expm1(self.reach))
 
+    def leaps(self, u):
+        return self.limits(u)[0], np.full(len(u), np.inf)
+
     def take_step(self, u, step):
         """u of x + dx/du · step: signals are more nearly linear in a coefficient than in its logarithm."""
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -215,11 +222,16 @@ class Between(AbstractSeparable):
         return np.log((x - self.lower) / (self.upper - x))
 
     def limits(self, u):
+        return self._steps_to(u, u - self.reach, u + self.reach)
+
+    def leaps(self, u):
+        return self._steps_to(u, np.minimum(u, 0.0) - self.reach, np.maximum(u, 0.0) + self.reach)
+
+    def _steps_to(self, u, *ends):
         each = _logistic(u) * _logistic(-u)
         with np.errstate(invalid="ignore", divide="ignore"):  # NaN, no limit, where x is rounded to its bound
             low, high = (
-                np.where(u < 0, _logistic(u + by) - _logistic(u), _logistic(-u) - _logistic(-u - by)) / each
-                for by in (-self.reach, self.reach)
+                np.where(u < 0, _logistic(end) - _logistic(u), _logistic(-u) - _logistic(-end)) / each for end in ends
             )
         return low, high
 
@@ -417,7 +429,8 @@ class Smooth(AbstractTransform):
 
     So a prior density exp(−λ |D x|²/2), with λ the `strength`, is one of independent u. `basis` (n, m) is B, `back`
     (m, n) its inverse, `rough` (m,) is 1 or 0 for each of the u; `knots` (n,) are the places of the numbers, None of
-    several arguments.
+    several arguments. One direction changes x by `largest` in one step of the search: those of a potential, in which
+    motion is nearly linear, by anything, logarithms of friction and inertia as those of a positive number.
     """
 
     reach: ClassVar[float] = np.inf
@@ -427,6 +440,7 @@ class Smooth(AbstractTransform):
     back: np.ndarray
     rough: np.ndarray
     knots: np.ndarray | None
+    largest: float
     strength: float = 1e-6
 
     @classmethod
@@ -441,10 +455,15 @@ class Smooth(AbstractTransform):
         scale = np.sqrt(sizes[rough])
         basis = np.concatenate([straight, vectors[:, rough] / scale], axis=1)
         back = np.concatenate([straight.T, scale[:, None] * vectors[:, rough].T])
-        return cls(basis, back, (np.arange(basis.shape[1]) >= straight.shape[1]).astype(float), knots)
+        rough_ones = (np.arange(basis.shape[1]) >= straight.shape[1]).astype(float)
+        return cls(basis, back, rough_ones, knots, np.inf if gauge else AbstractTransform.reach)
 
     def count_unknowns(self, count):
         return self.basis.shape[1]
+
+    def limits(self, u):
+        ends = self.largest / np.abs(self.basis).max(axis=0)
+        return -ends, ends
 
     def prior_weights(self, count):
         return np.sqrt(self.strength) * self.rough

@@ -188,9 +188,9 @@ def row_sizes(residuals: Residuals, point: Trial) -> list[np.ndarray]:
 def growth(sizes: list[np.ndarray]) -> float:
     """The growth of rows (N, T, S) along the record in which they grow most, from the first that is not zero."""
     found = 1.0
-    for row in (row for batch in sizes for row in batch.max(axis=2)):
-        if row.any():
-            found = max(found, float(row.max() / row[np.argmax(row > 0)]))
+    for rows in (batch.max(axis=2) for batch in sizes):
+        first = np.take_along_axis(rows, np.argmax(rows > 0, axis=1)[:, None], axis=1)[:, 0]
+        found = max(found, float((rows.max(axis=1) / np.where(first > 0, first, 1.0)).max(initial=1.0)))
     return found
 
 
@@ -216,6 +216,8 @@ def _norm(x: np.ndarray, axis) -> np.ndarray:
 def eliminate_starts(triangles: np.ndarray, slopes: np.ndarray, states: int) -> np.ndarray:
     """Columns of parameters less what starts replace, (N, ..., D) → (N, ..., F); unseen directions replace nothing."""
     of_starts, of_u = triangles[..., :states], triangles[..., states:-1]
+    if not of_starts.any():
+        return slopes[..., states:]
     instead = decide(of_starts[:, None], _UNFELT).least_norm(of_u.swapaxes(1, 2)).swapaxes(1, 2)
     shape = (len(slopes), *[1] * (slopes.ndim - 3), *instead.shape[1:])
     return slopes[..., states:] - np.matmul(slopes[..., :states], instead.reshape(shape))

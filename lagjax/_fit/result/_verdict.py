@@ -23,6 +23,7 @@ import numpy as np
 
 from lagjax._equations import decide
 from lagjax._fit.model._noise import AbstractNoise
+from lagjax._fit.model._parameters import stack_rows
 from lagjax._fit.model._records import Record
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals, Trial, compress_rows
 from lagjax._fit.model._sensor_faults import TOO_COARSE, constant_signals, describe_sensors
@@ -189,11 +190,11 @@ def _describe_end(name: str, bounds: tuple[float, float], x: float, step: float,
 
 
 def _disagreements(
-    residuals: Residuals, triangles: np.ndarray, known: Information, inside: np.ndarray, motion: dict[int, float]
+    residuals: Residuals, triangles: np.ndarray, known: Information, inside: np.ndarray, motion: np.ndarray
 ) -> tuple[list[str], list[str]]:
     """Sentences for records of another motion, and for those that show what the scene lacks, each differently. Only of
-    parameters that all share, `inside` (F,) of their sets; `motion` is the sum of squares left in a record beyond white
-    noise."""
+    parameters that all share, `inside` (F,) of their sets; `motion` (R,) is the sum of squares left in each record
+    beyond white noise."""
     records, unknowns = np.array([piece.record for piece in residuals.pieces]), residuals.unknowns
     count, shared = len(np.unique(records)), unknowns.shared[inside[unknowns.shared]]
     if known.null.shape[1] or count < 2 or not len(shared):
@@ -204,21 +205,29 @@ def _disagreements(
     prior = residuals.parameters.prior_weights[shared]
     shifts = shifts_without(own, triangles[..., columns], records, *variances, prior)
     labels = [residuals.parameters.labels[k] for k in shared]
-    worst = [(k, int(np.argmax(np.abs(shift.sizes)))) for k, shift in shifts.items()]
-    worst = sorted((-abs(shifts[k].sizes[i]), k, i) for k, i in worst if abs(shifts[k].sizes[i]) > _DISAGREE)
-    apart = [(k, i) for _, k, i in worst if shifts[k].explained > _OWN * motion.get(k, 0.0)]
-    pulls = [(k, i) for _, k, i in worst if (k, i) not in apart]
+    if not len(shifts.records):
+        return [], []
+    most, explained = np.abs(shifts.sizes).max(axis=1), shifts.explained
+    worst = [k for k in np.argsort(-most, kind="stable").tolist() if most[k] > _DISAGREE]
+    apart = [k for k in worst if explained[k] > _OWN * motion[shifts.records[k]]]
+    pulls = [k for k in worst if explained[k] <= _OWN * motion[shifts.records[k]]]
     if count == 2:  # each moves as far without the other
         apart, pulls, how = apart[:1], [] if apart else pulls[:1], "contradicts the other record"
     else:
         apart, pulls, how = apart[:MOST_NAMED], pulls[:1], "disagrees with the others"
+
+    def clause(k: int) -> tuple[str, str]:
+        sizes = shifts.sizes[k]
+        place = int(np.argmax(np.abs(sizes)))
+        return residuals.label(shifts.records[k]), _shift_clause(labels[place], sizes[place])
+
     return (
-        [f"{residuals.label(k)} {how}: without it {_shift_clause(labels[i], shifts[k].sizes[i])}." for k, i in apart],
+        [f"{name} {how}: without it {moves}." for name, moves in map(clause, apart)],
         [
-            f"Without {residuals.label(k)} {_shift_clause(labels[i], shifts[k].sizes[i])}, more than its interval "
-            f"allows for. Parameters of its own would explain {100 * shifts[k].explained / motion[k]:.2g} % of the "
-            "motion that is left in it: the scene lacks something that differs from record to record."
-            for k, i in pulls
+            f"Without {name} {moves}, more than its interval allows for. Parameters of its own would explain "
+            f"{100 * explained[k] / motion[shifts.records[k]]:.2g} % of the motion that is left in it: the scene lacks "
+            "something that differs from record to record."
+            for k, (name, moves) in zip(pulls, map(clause, pulls), strict=True)
         ],
     )
 
@@ -228,42 +237,46 @@ def _shift_clause(label: str, shift: float) -> str:
     return f"{label} would move {way} by {abs(shift):.1f} of the standard deviations that chance gives it"
 
 
-class Shift(NamedTuple):
-    """A fit without a record: how far each u moves (F,), in standard deviations for records that agree, and by how much
-    parameters of its own would lower the record's sum of squares."""
+class Shifts(NamedTuple):
+    """The fits without one of the `records` (R,): how far each u moves, `sizes` (R, F), in standard deviations for
+    records that agree; by how much parameters of its own would lower the sum of squares of a record, `explained` (R,).
+    """
 
+    records: np.ndarray
     sizes: np.ndarray
-    explained: float
+    explained: np.ndarray
 
 
-def shifts_without(states: int, triangles, records: np.ndarray, variances, white, prior) -> dict[int, Shift]:
+def shifts_without(states: int, triangles, records: np.ndarray, variances, white, prior) -> Shifts:
     """The fit without one record, for each of them.
 
     `triangles` (N, …, 2n + F + 1) are those of the pieces, `records` (N,) says whose they are; `variances` (F,) are
     those of u, `white` (F,) what they were if residuals were white, and `prior` (F,) the weights of a prior of u, which
     holds with and without the record. A record without which something is not seen is left out, since there is nothing
     that it could disagree with.
+
+    With the rows m and residuals r of a record, and H = RᵀR of all and the prior, W = m R⁻¹ = U S Vᵀ has its singular
+    values below 1. H − mᵀm = Rᵀ (1 − Wᵀ W) R, so that u moves by R⁻¹ V S (1 − S²)⁻¹ Uᵀ r (Woodbury), and the variance
+    that is missed is the diagonal of R⁻¹ V S² (1 − S²)⁻¹ Vᵀ R⁻ᵀ.
     """
     # The residual is one more column of the parameters, so that the starts are taken out of it as well.
     own = eliminate_starts(np.concatenate([triangles, triangles[..., -1:]], axis=-1), triangles, states)
+    own = own.reshape(len(own), -1, own.shape[-1])
     size, growth = 1.0 / np.sqrt(white), np.sqrt(np.maximum(variances / white, 1.0))
-    held, found = np.pad(np.diag(prior), ((0, 0), (0, 1))), {}
-
-    def slopes_of(rows: np.ndarray) -> np.ndarray:
-        rows = np.concatenate([rows.reshape(-1, own.shape[-1]), held])
-        return compress_rows(rows[None])[0][:, :-1] / size
-
-    whole = slopes_of(own)
-    for k in np.unique(records):
-        rest = slopes_of(own[records != k])
-        if decide(rest, _SEEN).rank < rest.shape[1]:
-            continue
-        mine = own[records == k].reshape(-1, own.shape[-1])
-        slopes, residuals = mine[:, :-1] / size, mine[:, -1]
-        without, beside = np.linalg.inv(rest.T @ rest), np.linalg.inv(whole.T @ whole)
-        shift = without @ slopes.T @ residuals
-        chance = np.sqrt(np.maximum(np.diag(without) - np.diag(beside), 1e-12 * np.diag(without)))
-        decided = decide(slopes, _SEEN)
-        along = decided.left[:, : int(decided.rank)].T @ residuals
-        found[int(k)] = Shift(shift / (chance * growth), float(along @ along))
-    return found
+    held = np.pad(np.diag(prior), ((0, 0), (0, 1)))
+    whole = compress_rows(np.concatenate([own.reshape(-1, own.shape[-1]), held])[None])[0][:-1, :-1] / size
+    if decide(whole, _SEEN).rank < whole.shape[1]:
+        return Shifts(np.zeros(0, int), np.zeros((0, len(white))), np.zeros(0))
+    names, which = np.unique(records, return_inverse=True)
+    mine = compress_rows(stack_rows(own, which))
+    half = np.linalg.inv(whole)
+    left, values, right = np.linalg.svd(mine[..., :-1] / size @ half, full_matrices=False)
+    along = np.sum(left * mine[..., -1:], axis=1)
+    seen = values[:, 0] ** 2 < 1.0 - _SEEN**2
+    left_over = np.where(seen[:, None], 1.0 - values**2, 1.0)
+    moved = half @ right.swapaxes(1, 2)
+    shift = np.matmul(moved, (along * values / left_over)[..., None])[..., 0]
+    chance = np.sqrt(np.sum(moved**2 * (values**2 / left_over)[:, None], axis=2))
+    least = 1e-6 * np.sqrt(np.sum(half**2, axis=1))  # of a record that says nothing
+    explained = np.sum(np.where(values > _SEEN * values[:, :1], along, 0.0) ** 2, axis=1)
+    return Shifts(names[seen], (shift / np.maximum(chance, least) / growth)[seen], explained[seen])

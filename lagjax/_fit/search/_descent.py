@@ -35,6 +35,7 @@ _FIRST, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-14, 1e12
 _PATIENCE = 12  # trials that lowered the sum of squares by less than ends a search, while derivatives promised more
 _NEAR = 1e-3  # per sample: where it pays to look at how much the residuals are correlated
 _FLAT = 1e-13  # relative: half the sum of squares is itself rounded to so much
+_STOPPED = "The search was stopped after {} trials: half the sum of squares may fall by {:.2g}."
 _KINK = (
     "The search stopped at a kink of the sum of squares after {} trials: derivatives promise to lower half of it by "
     "{:.2g}, the last {} trials lowered it by {:.2g}. Motion that sticks, or strikes, has such kinks; friction that "
@@ -93,11 +94,29 @@ class _Model:
         pulled = 0.5 * float(np.sum(self.anchor.pull(trial.u) ** 2))
         return self.residuals.cost(trial, self.factors, self.noise) + pulled
 
-    def step(self, damping: float) -> DescentStep:
+    def step(self, damping: float, limits: tuple[np.ndarray, np.ndarray] | None = None) -> DescentStep:
         u, states, unknowns = self.trial.u, self.residuals.states, self.unknowns
-        pull, limits = (self.anchor.weight, self.anchor.pull(u)), self.residuals.parameters.limits(u)
+        limits = self.residuals.parameters.limits(u) if limits is None else limits
+        pull = self.anchor.weight, self.anchor.pull(u)
         scale = column_norms(self.triangles, states, unknowns)
         return eliminate(self.triangles, states, scale, damping, pull, unknowns, limits)
+
+    def leap(self, enough: float) -> tuple[float, Trial | None]:
+        """The gain that a step promises which may end anywhere in the sets of numbers, and a better trial on its way.
+
+        Next to a bound, where a positive number is too small by many orders, u has no slope, and no step within reach
+        has any gain.
+        """
+        residuals, at = self.residuals, self.trial
+        step = self.step(_LEAST_DAMPING, residuals.parameters.leaps(at.u))
+        if not self.is_enough(step.gain, enough):
+            for part in (1.0, 0.1, 0.01):
+                with contextlib.suppress(LostMotion):
+                    u = residuals.parameters.take_step(at.u, part * step.u)
+                    trial = residuals.evaluate(Point(u, at.starts + part * step.starts))
+                    if not self.is_enough(self.cost - self.cost_of(trial), enough):
+                        return step.gain, trial
+        return step.gain, None
 
     def is_enough(self, gain: float, enough: float) -> bool:
         """True if half the sum of squares is at most `enough`, correlated residuals counted for what they are worth."""
@@ -125,7 +144,13 @@ def minimise(
         gain = model.step(_LEAST_DAMPING).gain
         end = functools.partial(Descent, residuals, trial, model.noise)
         if model.is_enough(gain, enough):
-            return end(True, trials, f"The search converged after {trials} trials.")
+            gain, farther = model.leap(enough)
+            if farther is not None and trials < limit:
+                trial, trials = farther, trials + 1
+                continue
+            if model.is_enough(gain, enough):
+                return end(True, trials, f"The search converged after {trials} trials.")
+            return end(False, trials, _STOPPED.format(trials, gain))
         recent = sum(fall for place, fall in falls if place > trials - _PATIENCE)
         if trials > _PATIENCE and model.is_enough(recent, enough):
             return end(False, trials, _KINK.format(trials, gain, _PATIENCE, recent))
@@ -133,8 +158,7 @@ def minimise(
         if better is None and trials < limit:
             return end(True, trials, f"The search stopped where rounding hides what is left, after {trials} trials.")
         if better is None:
-            text = f"The search was stopped after {trials} trials: half the sum of squares may fall by {gain:.2g}."
-            return end(False, trials, text)
+            return end(False, trials, _STOPPED.format(trials, gain))
         falls.append((trials, model.cost - model.cost_of(better)))
         trial = better
 
@@ -180,14 +204,17 @@ def eliminate(
 
 def _limited_step(rows: np.ndarray, of_u: np.ndarray, damping: float, pull, unknowns: Unknowns, limits) -> np.ndarray:
     """δu (F,) that minimises |rows (δu, 1)|² + |pull|² + Σ damping (scale δu)², over rows (N, M, L + 1) of pieces, with
-    more damping of what is beyond limits."""
+    more damping of what is beyond limits. Where no damping is enough, as for the logarithm of a number that is too
+    small by many orders, the step is shortened to them."""
     rows, each = unknowns.stack_by_owner(rows), np.full(len(of_u), damping)
     rows = rows if unknowns.own else compress_rows(rows.reshape(1, -1, rows.shape[-1]))
     while True:
         du = _damped_step(rows, np.sqrt(each) * of_u, pull, unknowns)
         beyond = (du < limits[0]) | (du > limits[1])
-        if not beyond.any() or each[beyond].min() > _MOST_DAMPING:
+        if not beyond.any():
             return du
+        if each[beyond].min() > _MOST_DAMPING:
+            return du * np.min(np.where(du > 0, limits[1], limits[0])[beyond] / du[beyond])
         each[beyond] *= 10.0
 
 

@@ -31,6 +31,7 @@ from lagjax._fit.search._multistart import misfit
 from lagjax._fit.search._reader import Reader, pad_states, short_windows, time_scales
 from lagjax._fit.search._unexplained import measure_unexplained
 from lagjax._run.hybrid import jumps
+from lagjax._show import even_places
 
 # In units of half the sum of squares: the end of a search, where parameters are within 0.05 standard deviations of
 # independent noise, and, per sample, that of a level of growing segments, whose answer is only where the next begins.
@@ -42,6 +43,10 @@ _TRIALS, _TRIALS_OF_LEVEL = 60, 20
 _WORSE = 5.0  # times more that a join may leave: without friction it was 3, beyond the horizon 10 and more
 _LOST = 2  # levels that may be lost: after one the next may find the motion again, with better parameters
 _LYAPUNOV = 5.0  # times 1/λ that a record is long: shorter ones are followed whole
+# Records of a sample that is searched before all of them, the samples that it has for each unknown, and times as many
+# records from which on it pays.
+_SAMPLED, _SAMPLES_EACH, _PAYS = 64, 30, 4
+_SUSPECT, _SAMPLES_OF_LEVEL = 0.05, 4  # of the signals, left by a search; samples for each unknown in first samples
 _GRADIENT_STEPS = 3000  # of a descent by gradients
 
 
@@ -66,15 +71,67 @@ class Search:
             return self._search_pieces(levels_done[good], levels_done[-1])
         done, lost = None, LostMotion()
         try:
-            done = minimise(self.residuals, point, self.law, _ENOUGH, _TRIALS)
+            done = self._minimise_whole(point)
         except LostMotion as reason:
             lost = reason
         if levels_done and (done is None or not done.converged or measure_unexplained(done).motion):
             good = _last_followed_level([*levels_done, *([] if done is None else [done])])
             if good < len(levels_done) and misfit(levels_done[good].noise, levels_done[good].residuals) < _COARSE:
                 return self._search_pieces(levels_done[good], done)
+        if self._knows_starts() and (done is None or measure_unexplained(done).share > _SUSPECT):
+            done = self._search_beginnings(point, done)
         if done is None:
             raise lost
+        return done
+
+    # ---- whole records ----
+
+    def _minimise_whole(self, point: Point) -> Descent:
+        """The search of whole records from a point; that of many begins where the search of a sample of them ends."""
+        places = self._sample_records()
+        if len(places) < len(self.residuals.pieces):
+            with contextlib.suppress(LostMotion):
+                begin = self._minimise_sample(point, places, None)
+                return minimise(self.residuals, begin, self.law, _ENOUGH, _TRIALS)
+        return minimise(self.residuals, point, self.law, _ENOUGH, _TRIALS)
+
+    def _sample_records(self) -> np.ndarray:
+        """The places of all pieces, or of an even sample of them where a part says enough about the parameters."""
+        residuals = self.residuals
+        followed = residuals.unknowns.columns.shape[1] + residuals.states * residuals.fitted.any()
+        count = max(_SAMPLED, round(_SAMPLES_EACH * followed * len(residuals.pieces) / residuals.measured))
+        every = len(residuals.pieces)
+        return even_places(every, count if _PAYS * count <= every else every)
+
+    def _minimise_sample(self, point: Point, places: np.ndarray, length: int | None) -> Point:
+        """The point with what the search of the pieces at `places`, up to a number of samples of each, comes to."""
+        residuals = self.residuals
+        pieces = [Piece(k, samples[:length]) for k, samples in (residuals.pieces[place] for place in places)]
+        part = residuals.with_pieces(pieces, residuals.fitted[places])
+        begin, enough = Point(point.u, point.starts[places]), _ENOUGH_OF_LEVEL * part.measured
+        end = minimise(part, begin, self.law, enough, _TRIALS_OF_LEVEL if length else _TRIALS).trial
+        starts = point.starts.copy()
+        starts[places] = end.starts
+        return Point(end.u, starts)
+
+    def _knows_starts(self) -> bool:
+        """True where "auto" may begin with the first samples of records: all starts are known, and no motion jumps."""
+        residuals = self.residuals
+        plain = not any(jumps(part.scene) or part.clocks or part.signals.delays is not None for part in residuals.parts)
+        return self.method == "auto" and plain and not any(self.readers) and not residuals.fitted.any()
+
+    def _search_beginnings(self, point: Point, done: Descent | None) -> Descent | None:
+        """The likelier one of `done` and the search that begins with the first samples of the records, ever more."""
+        residuals, places, length = self.residuals, self._sample_records(), 2
+        longest = max(len(piece.places) for piece in residuals.pieces)
+        signals = residuals.measured / sum(len(piece.places) for piece in residuals.pieces)
+        with contextlib.suppress(LostMotion):
+            while length < longest:
+                if (length - 1) * len(places) * signals > _SAMPLES_OF_LEVEL * len(point.u):
+                    point = self._minimise_sample(point, places, length)
+                length = 2 * length - 1
+            both = [self._minimise_whole(point), *([] if done is None else [done])]
+            return max(both, key=lambda one: residuals.log_likelihood(one.trial, one.noise))
         return done
 
     def _search_pieces(self, level: Descent, joined: Descent | None) -> Descent:

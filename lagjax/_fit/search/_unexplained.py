@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._fit.model._autocorrelation import correlated_power
+from lagjax._fit.model._autocorrelation import correlated_power, first_lag_products
 from lagjax._fit.search._descent import Descent
 
 MOST_NAMED = 3
@@ -34,28 +34,26 @@ def measure_unexplained(done: Descent) -> Unexplained:
     of_records = np.zeros(len(residuals.records))
     for signal, name in enumerate(residuals.names):
         parts = _measure_records(done, signal)
-        if not parts:
+        if not len(parts.records):
             continue
-        samples, *squares = np.array(list(parts.values())).T
-        rms, motion, own = (np.sqrt(samples @ x / samples.sum()) for x in squares)
+        total = parts.samples.sum()
+        rms, motion, own = (float(np.sqrt(parts.samples @ x / total)) for x in (parts.left, parts.motion, parts.own))
         shares.append(rms / own if own > 0 else np.inf if rms > 0 else 0.0)
-        doubted |= bool(motion > _DOUBTED * own)
-        for k, part in parts.items():
-            of_records[k] = max(of_records[k], part.motion / own**2 if own > 0 else 0.0)
+        doubted |= motion > _DOUBTED * own
+        if own > 0:
+            of_records[parts.records] = np.maximum(of_records[parts.records], parts.motion / own**2)
         if motion > _UNEXPLAINED * own:
             left.append(f"The fit leaves {_percent(rms, own)} of {name}: its motion is not that of the scene.")
         elif rms > _UNEXPLAINED * own:
             noisy.append(f"The noise is {_percent(rms, own)} of {name}.")
-        each = {
-            k: np.sqrt(part.motion / part.own) if part.own > 0 else np.inf
-            for k, part in parts.items()
-            if part.motion > max(_UNEXPLAINED**2 * part.own, (_FAINT * own) ** 2)
-        }
-        worst = sorted(each, key=lambda k: -each[k])[:MOST_NAMED] if len(each) < len(parts) else []
+        large = np.flatnonzero(parts.motion > np.maximum(_UNEXPLAINED**2 * parts.own, (_FAINT * own) ** 2))
+        with np.errstate(divide="ignore"):
+            order = np.argsort(-parts.motion[large] / parts.own[large], kind="stable")
         left += [
-            f"The fit leaves {_percent(np.sqrt(parts[k].left), np.sqrt(parts[k].own))} of {name} in "
-            f"{residuals.label(k)}, and less in others: is it a record of this scene, with the signs of the others?"
-            for k in worst
+            f"The fit leaves {_percent(np.sqrt(parts.left[k]), np.sqrt(parts.own[k]))} of {name} in "
+            f"{residuals.label(parts.records[k])}, and less in others: is it a record of this scene, with the signs of "
+            "the others?"
+            for k in (large[order][:MOST_NAMED] if len(large) < len(parts.records) else ())
         ]
     return Unexplained(left, noisy, float(max(shares)), doubted, np.argsort(-of_records, kind="stable").tolist())
 
@@ -64,41 +62,48 @@ def _percent(part: float, whole: float) -> str:
     return f"{100 * part / whole:.3g} %" if part < 10.0 * whole else "far more than all"
 
 
-class _Part(NamedTuple):
-    """Of one signal in one record: the samples that count, and mean squares of residuals, of their part beyond white
-    noise and rounding, and of the signal about its mean."""
+class _Parts(NamedTuple):
+    """Of one signal in the `records` (R,) that show it: the samples that count, and mean squares of residuals, of their
+    part beyond white noise and rounding, and of the signal about its mean."""
 
-    samples: float
-    left: float
-    motion: float
-    own: float
+    records: np.ndarray
+    samples: np.ndarray
+    left: np.ndarray
+    motion: np.ndarray
+    own: np.ndarray
 
 
-def _measure_records(done: Descent, signal: int) -> dict[int, _Part]:
+def _measure_records(done: Descent, signal: int) -> _Parts:
     residuals, trial, noise = done.residuals, done.trial, done.noise
-    rounding, pieces = np.nan_to_num(residuals.sensor.step[signal]) ** 2 / 12, {}
+    owners, records = np.array([piece.record for piece in residuals.pieces]), len(residuals.records)
+    batches = []
     for batch, r, factors in zip(residuals.batches, trial.residuals, residuals.factors(trial, noise), strict=True):
         counts = (factors[..., signal] * noise.sigma[signal]) ** 2
-        for row, place in enumerate(batch.rows):
-            if counts[row].any():
-                own = np.stack([r[row, :, signal], batch.values[row, :, signal], counts[row]])
-                pieces.setdefault(residuals.pieces[place].record, []).append(own)
-    found = {}
-    for k, rows in pieces.items():
-        longest = max(row.shape[1] for row in rows)
-        r, values, counts = np.stack([np.pad(row, ((0, 0), (0, longest - row.shape[1]))) for row in rows], axis=1)
-        samples = counts.sum()
-        mean = np.sum(counts * values) / samples
-        motion = correlated_power(np.sqrt(counts) * r, counts > 0) * (counts > 0).sum() / samples
-        squares = (np.sum(counts * x**2) / samples for x in (r, values - mean))
-        found[k] = _Part(samples, next(squares), max(motion - rounding, 0.0), next(squares))
-    return found
+        batches.append((owners[batch.rows], counts, r[..., signal], batch.values[..., signal]))
+
+    def add(each: list[np.ndarray]) -> np.ndarray:
+        """The sums (R,) or (R, K) of what the pieces (N,) or (N, K) of batches hold."""
+        total = np.zeros((records, *each[0].shape[1:]))
+        for (places, *_), part in zip(batches, each, strict=True):
+            np.add.at(total, places, part)
+        return total
+
+    samples, many = (add([x.sum(axis=1) for x in y]) for y in zip(*((c, c > 0) for _, c, *_ in batches), strict=True))
+    unit = np.where(samples > 0, samples, 1.0)
+    mean = add([np.sum(counts * values, axis=1) for _, counts, _, values in batches]) / unit
+    left = add([np.sum(counts * r**2, axis=1) for _, counts, r, _ in batches]) / unit
+    own = add([np.sum(c * (values - mean[k, None]) ** 2, axis=1) for k, c, _, values in batches]) / unit
+    sums = add([first_lag_products(np.sqrt(counts) * r, counts > 0) for _, counts, r, _ in batches])
+    rounding = np.nan_to_num(residuals.sensor.step[signal]) ** 2 / 12
+    motion = np.maximum(correlated_power(sums, many) * many / unit - rounding, 0.0)
+    shown = np.flatnonzero(samples > 0)
+    return _Parts(shown, *(x[shown] for x in (samples, left, motion, own)))
 
 
-def unexplained_motion(done: Descent) -> dict[int, float]:
-    """The sum of squares that a search leaves beyond white noise in every record, in units of the noise."""
-    found: dict[int, float] = {}
+def unexplained_motion(done: Descent) -> np.ndarray:
+    """The sum of squares (R,) that a search leaves beyond white noise in every record, in units of the noise."""
+    found = np.zeros(len(done.residuals.records))
     for signal, sigma in enumerate(done.noise.sigma):
-        for k, part in _measure_records(done, signal).items():
-            found[k] = found.get(k, 0.0) + part.samples * part.motion / sigma**2
+        parts = _measure_records(done, signal)
+        found[parts.records] += parts.samples * parts.motion / sigma**2
     return found

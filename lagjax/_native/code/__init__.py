@@ -1,8 +1,8 @@
-"""The words of machine code, which know nothing of a motion.
+"""The means to emit machine code, independent of mechanics.
 
-_constants    every numerical choice, with its reason
-_objects      machine code kept on disk
+_constants    every numerical constant of the kernels, with its reason
+_objects      compiled objects kept on disk
 _ir           LLVM's instructions, written like arithmetic
-_frame        the memory of a thread, the lanes and the job, as a function of a kernel sees them
+_frame        a kernel function with named access to the memory of its thread, to lanes and to the job
 _loops        loops and decisions over numbers, written in Python, as machine code
 """

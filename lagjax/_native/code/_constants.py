@@ -1,8 +1,9 @@
-"""Every numerical choice of the kernels: what it bounds, where it comes from, and what happens if it is doubled.
+"""Every numerical constant of the kernels: what it bounds, where it comes from, and what happens if it is doubled.
 
 "Measured" means: varied by factors of two on free motions (double pendulum, Kepler at e = 0.9), borders (a wedge, a
 bump and a pulse of the force), constrained ones (a double pendulum in Cartesian coordinates, a slider-crank through its
-dead centres) and events (waves, grazing, two crossings 2e-5 apart). Else neither factor changed a step.
+dead centres) and events (waves, grazing, two crossings 2e-5 apart). Where nothing is said, neither factor changed a
+step.
 """
 
 EPS = 2.0**-52  # from 1 to the next double

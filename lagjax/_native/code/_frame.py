@@ -1,13 +1,13 @@
-"""A function of a kernel, and what it reads: the memory of its thread by name, one lane of it, the job of all threads.
+"""`Frame`: a kernel function under construction, with access by name to thread memory, single lanes and the job.
 
-A thread works on as many members as a vector has lanes. Its memory is an array of vectors, one element a lane; a
-`Memory` gives each of them a name. A `Frame` is a function of the kernel under construction, which reads and writes
-these like dictionaries:
+A thread integrates as many members as a vector has lanes. Its memory is an array of vectors, with one element per lane;
+a `Memory` gives each of them a name. The *job* is the structure of arguments shared by all threads. A `Frame` reads and
+writes these like dictionaries:
 
-    frame["h"] = 0.5 * frame["h"]               the steps of all lanes, a vector
+    frame["h"] = 0.5 * frame["h"]               the step sizes of all lanes, a vector
     frame["y", i, k]                            coefficient k of component i of the state
-    lane["steps"] + 1.0                         one lane's count of steps, a double; `lane` = frame.lane(j)
-    lane["member"]                              which member it carries, an integer
+    lane["steps"] + 1.0                         the step count of one lane, a double; `lane` = frame.lane(j)
+    lane["member"]                              the member in that lane, an integer
     frame.job("order"), frame.read("ts", i)     a field of the job, and an element of an array it points to
 
 Every function takes three pointers, to the job, the memory and the integers of the lanes, and then its own arguments.
@@ -36,7 +36,7 @@ KINDS = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOU
 def job(
     name: str, pointers: tuple[str, ...], integers: tuple[str, ...], doubles: tuple[str, ...] = (), *others: str
 ) -> type:
-    """The structure of what all threads work on: eight bytes for each field; the `others` are pointers, too."""
+    """The ctypes structure of the arguments shared by all threads, eight bytes per field; `others` are pointers too."""
     fields = [
         *((field, ctypes.c_void_p) for field in pointers),
         *((field, ctypes.c_int64) for field in integers),
@@ -47,7 +47,7 @@ def job(
 
 
 def integers(module: ir.Module, numbers: np.ndarray) -> ir.GlobalVariable:
-    """A constant array of integers, as its bytes: their text is short, and read fast."""
+    """A constant array of int64 in the module, stored as bytes, whose text is short and fast to parse."""
     data = bytearray(numbers.tobytes())
     kind = ir.ArrayType(ir.IntType(8), len(data))
     table: Any = ir.GlobalVariable(module, kind, module.get_unique_name("integers"))
@@ -61,7 +61,7 @@ Fields = dict[str, Any]
 
 
 class Memory:
-    """The places of a thread's `fields`, vectors of `width` lanes; one `beside` another shares its memory."""
+    """The layout of a thread's memory: named vectors of `width` lanes; one `beside` another shares its memory."""
 
     def __init__(self, width: int, fields: Fields, beside: "Memory | None" = None):
         self.width, self._columns, self._offsets = width, {}, {}
@@ -70,7 +70,7 @@ class Memory:
 
     @property
     def size(self) -> int:
-        """The memory that a thread needs, in doubles: whole cache lines."""
+        """The memory of a thread in doubles, rounded up to whole cache lines."""
         return -(-self._doubles[0] // CACHE_LINE) * CACHE_LINE
 
     @property
@@ -84,7 +84,7 @@ class Memory:
             self._doubles[0] = self.end + rows * self._columns[name] * self.width
 
     def place(self, name: str, *indices: Index) -> Any:
-        """The first element of a vector, counted in doubles: `name`, `name[i]` or `name[i, k]`."""
+        """The offset, in doubles, of the vector `name`, `name[i]` or `name[i, k]`."""
         row, column = (*indices, 0, 0)[:2]
         columns = self._columns[name]
         index = row if columns == 1 else column if isinstance(row, int) and row == 0 else column + row * columns
@@ -93,10 +93,10 @@ class Memory:
 
 @dataclass(frozen=True, eq=False)
 class Vectors:
-    """A number of vectors in a row, as a list of them would be: `read(i)` gives one, and `write(i, x)` sets it.
+    """A sequence of `count` vectors without a list: `read(i)` gives vector i, and `write(i, x)` sets it.
 
-    `place(i)` is the place of vector i, counted in doubles from the beginning of the thread's memory, if it is known;
-    or where it would lie if `shift` were zero.
+    `place(i)` is the offset of vector i in the thread's memory, in doubles, if it is known; `shift` is a further offset
+    known at run time only.
     """
 
     count: int
@@ -117,7 +117,7 @@ class Vectors:
 
 
 class Frame:
-    """A function of a kernel under construction, with named access to all that it sees."""
+    """A kernel function under construction, with access by name to everything it reads and writes."""
 
     def __init__(self, module: ir.Module, layout: Memory, job: type, name: str, *kinds: ir.Type, **options):
         self.code = Code(module, name, [POINTER] * 3 + list(kinds), layout.width, **options)
@@ -142,13 +142,13 @@ class Frame:
 
     @contextmanager
     def where(self, mask: Value) -> Iterator[None]:
-        """Within it, assignments to vectors change the lanes of the mask alone, as `x[mask] = y` does in NumPy."""
+        """A context in which assignments to vectors change only the lanes of the mask, as `x[mask] = y` in NumPy."""
         before, self._mask = self._mask, mask if self._mask is None else self._mask & mask
         yield
         self._mask = before
 
     def assign(self, mask: Value, *indices: Index, **values: "Value | float") -> None:
-        """Set fields by name, each at the same indices, in the lanes of a mask."""
+        """Set the given fields, all at the same indices, in the lanes of a mask."""
         with self.where(mask):
             for name, value in values.items():
                 self[(name, *indices)] = value
@@ -157,7 +157,7 @@ class Frame:
         return self.code.element(self._memory, self.layout.place(name, *indices))
 
     def vectors(self, name: str, count: int, place: Callable[[Index], tuple] = lambda i: (i,)) -> Vectors:
-        """Vectors of a field: number i is `name[place(i)]`, whose place does not change."""
+        """The `count` vectors `name[place(i)]` of a field, at offsets known at compile time."""
 
         def where(i):
             return self.layout.place(name, *place(i))
@@ -168,7 +168,7 @@ class Frame:
         return Vectors(count, lambda i: self[name, *place(i)], write, where)
 
     def vectors_at(self, name: str, count: int, k: Value, by_row: bool = False) -> Vectors:
-        """Column k of a field, from the first row on; or row k, from the first column on."""
+        """Column k of a field, from its first row on; or, with `by_row`, row k from its first column on."""
 
         def index(i):
             return (k, i) if by_row else (i, k)
@@ -187,7 +187,7 @@ class Frame:
         return Lane(self, index)
 
     def view(self, layout: Memory) -> "Frame":
-        """The frame of this function over the fields of another `layout` of its memory."""
+        """The frame of the same function with the fields of a second `layout` of its memory."""
         other = copy.copy(self)
         other.layout, other.width = layout, layout.width
         return other
@@ -216,7 +216,7 @@ class Frame:
         return self.code.element(self._memory, offset)
 
     def call(self, function: Code, *arguments: Value) -> None:
-        """Another function of the kernel, on the same job, memory and lanes."""
+        """Call another kernel function on the same job, memory and lanes."""
         self.code.call(function, self._job, self._memory, self._integers, *arguments)
 
     def finish(self, result: Value | None = None) -> Code:
@@ -224,7 +224,7 @@ class Frame:
 
 
 class Lane:
-    """One lane of a frame: doubles of its memory, and its integers."""
+    """One lane of a frame, by name: the doubles of its memory and its integers."""
 
     def __init__(self, frame: Frame, index: Value):
         self._frame, self._index = frame, index

@@ -1,13 +1,13 @@
 """LLVM's intermediate representation, written like arithmetic.
 
-`Code` appends instructions to one function; a `Value` is what one of them yields, with the operators of Python:
+`Code` appends instructions to one function; a `Value` is the result of one, with the operators of Python:
 
     with code.loop(n) as i:
         y = code.load(row + i * width, VECTOR)
         code.store(y * y + 1.0, row + i * width)
 
-emits the loop. A number is a double, an integer (64 bits) or a vector of doubles, one for each lane. A sum of products
-may be contracted to fused multiply-adds, but in code that `rounds` each; nothing else is loosened.
+emits the loop. A number is a double, an integer (64 bits) or a vector of doubles, one for each lane. Products and sums
+may be contracted to fused multiply-adds, unless the code `rounds` each operation; no further relaxation is allowed.
 """
 
 import ctypes
@@ -35,7 +35,7 @@ _BEHIND_INTRINSICS = ("rint", "round", "floor", "ceil", "trunc", "fma", "fmod")
 
 @functools.cache
 def _host_target() -> llvm.Target:
-    """LLVM's target for this kind of processor, after LLVM is made ready."""
+    """LLVM's target for this kind of processor; initialises LLVM."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     for name in _BEHIND_INTRINSICS:
@@ -59,7 +59,7 @@ _LARGE, LEVELS = 2**20, [2, 1]
 
 
 def _target_machine(level: int) -> llvm.TargetMachine:
-    """A target machine for this processor: an engine owns its own, and frees it in the end."""
+    """A new target machine for this processor, at an optimisation level; an engine owns and frees its own."""
     return _host_target().create_target_machine(
         cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=level
     )
@@ -67,7 +67,7 @@ def _target_machine(level: int) -> llvm.TargetMachine:
 
 @functools.cache
 def lanes() -> int:
-    """Doubles in a vector register; two registers' worth where those are short, to hide latencies."""
+    """The number of doubles per vector of a kernel: 8 with AVX-512, else 4; several registers if these are short."""
     return 8 if llvm.get_host_cpu_features().get("avx512f", False) else 4
 
 
@@ -81,7 +81,7 @@ _PASSES = ("sroa", "dead_code_elimination")
 def compile_module(
     module: ir.Module, functions: tuple[str, ...], level: int | None = None
 ) -> tuple[llvm.ExecutionEngine, dict[str, int]]:
-    """Machine code for a module, and where its functions are: it lives as long as the engine. Empties the module."""
+    """Compile a module: the engine, which owns the code, and the addresses of `functions`. Empties the module."""
     text = str(module)
     for function in module.functions:  # its instructions are freed at once
         for block in function.blocks:
@@ -92,7 +92,7 @@ def compile_module(
 def compile_text(
     write: Callable[[], str], functions: tuple[str, ...], known_by: str, level: int
 ) -> tuple[llvm.ExecutionEngine, dict[str, int]]:
-    """Machine code for the text of a module, which is written only where no object is kept that is known by this."""
+    """Compile the text of a module, or load the object kept under `known_by`: `write()` is called only without one."""
     machine = _target_machine(level)
     by = llvm.llvm_version_info, llvmlite.__version__, machine.triple, _PASSES, level
     processor = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
@@ -118,7 +118,7 @@ def _compile_object(text: str, level: int) -> bytes:
 
 
 def unroll_loops(module: ir.Module) -> None:
-    """Ask for the counted loops of a module to be unrolled, by the branches that close them."""
+    """Mark the counted loops of a module for full unrolling, by metadata at the branches that close them."""
     loop: Any = module.add_metadata([module.add_metadata(["llvm.loop.unroll.full"])])
     loop.operands = (loop, *loop.operands)  # a loop is known by a node that names itself
     for function in module.functions:
@@ -133,7 +133,7 @@ def unroll_loops(module: ir.Module) -> None:
 
 
 def _arithmetic_operators(op: str) -> "tuple[Callable[[Value, Any], Value], Callable[[Value, Any], Value]]":
-    """An operator of values, and the same where the value comes second."""
+    """The operator `op` of values, and its reflected form for a Python number on the left."""
     return lambda x, y: x.code.arithmetic(op, x, y), lambda x, y: x.code.arithmetic(op, y, x)
 
 
@@ -185,7 +185,7 @@ class Value:
 
 
 class Variable:
-    """A number or vector that changes: `value` is what it is here, and sets it. A register, after LLVM's passes."""
+    """A mutable number or vector of a function: read and set `value`. LLVM turns it into a register."""
 
     def __init__(self, place: Value, kind: ir.Type):
         self._place, self._kind = place, kind
@@ -210,19 +210,19 @@ def _typed(x: Value) -> str:
 
 
 def element_of(kind: ir.Type) -> ir.Type:
-    """The type of one lane of a vector; of a scalar its own."""
+    """The element type of a vector type; a scalar type itself."""
     return kind.element if isinstance(kind, ir.VectorType) else kind
 
 
 @functools.cache
 def _splat_constants(kind: ir.Type, lanes: int) -> tuple[ir.Constant, ...]:
-    """The constants that a number of this kind is put into all lanes with."""
+    """The constants of the instructions that copy a number of type `kind` into all lanes."""
     undefined = ir.Constant(ir.VectorType(kind, lanes), ir.Undefined)
     return undefined, ir.Constant(INTEGER, 0), ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
 
 
 class Code:
-    """The body of one function, growing at its end."""
+    """One function under construction; instructions are appended at its end."""
 
     def __init__(
         self, module: ir.Module, name: str, arguments: Sequence[ir.Type], lanes: int, result=None, public=False,
@@ -252,7 +252,7 @@ class Code:
     # ---- numbers ----
 
     def as_value(self, x, like: ir.Type) -> Value:
-        """A Python number, or a value, in the type `like`; a scalar becomes a vector of equal lanes."""
+        """A Python number or a value as a value of type `like`; a scalar is copied into all lanes of a vector."""
         if not isinstance(x, Value):
             return Value(self, self._constant(x, like))
         if isinstance(like, ir.VectorType) and not isinstance(x.it.type, ir.VectorType):
@@ -268,18 +268,18 @@ class Code:
         return ir.Constant(like, int(x) if isinstance(like, ir.IntType) else float(x))
 
     def lanes_of(self, x) -> Value:
-        """A vector of the code's numbers, with one number in every lane or with those of another vector."""
+        """A vector of doubles: a number copied into all lanes, or a vector as it is."""
         return self.as_value(x, self.vector)
 
     def arithmetic(self, op: str, a, b) -> Value:
-        """a op b for doubles, vectors or integers; a mixed pair becomes vectors."""
+        """The value a op b for doubles, vectors or integers; of a scalar and a vector, the scalar fills all lanes."""
         a, b = self._match_types(a, b)
         if isinstance(a.it.type, ir.IntType):
             return self.operate("sdiv" if op == "div" else op, a, b)
         return self.operate(f"f{op}" if op == "div" else f"f{op}{self._flags}", a, b)
 
     def compare(self, op: str, a, b) -> Value:
-        """False where a NaN is compared (except `!=`)."""
+        """The bits of a comparison; a comparison with NaN is false, except `!=`."""
         a, b = self._match_types(a, b)
         kind, name = a.it.type, _COMPARISONS[op]
         if element_of(kind) == DOUBLE:
@@ -295,7 +295,7 @@ class Code:
         return self.as_value(a, like), self.as_value(b, like)
 
     def select(self, condition: Value, yes, no) -> Value:
-        """`yes` where the condition holds, else `no`; two numbers are doubles, in the lanes of the condition."""
+        """`yes` where the condition is true, else `no`; two Python numbers become doubles of its shape."""
         if not isinstance(yes, Value) and not isinstance(no, Value):
             vector = isinstance(condition.it.type, ir.VectorType)
             yes = self.as_value(yes, self.vector if vector else DOUBLE)
@@ -306,23 +306,23 @@ class Code:
         return self.select(condition, 1.0, 0.0)
 
     def maximum(self, a, b) -> Value:
-        """The larger; `b` where they cannot be compared."""
+        """The larger of two values; `b` if one is NaN."""
         a, b = self._match_types(a, b)
         return self.select(a > b, a, b)
 
     def total(self, terms: Iterable[Value], start: "Value | float" = 0.0) -> Value:
-        """The sum of vectors, and of what it starts from; the terms may go round a loop of this code."""
+        """The sum of `start` and of the vectors `terms`, whose iteration may emit a loop."""
         total = self.variable(self.lanes_of(start))
         for term in terms:
             total.value += term
         return total.value
 
     def largest_or_nan(self, a: Value, b: Value) -> Value:
-        """The larger; NaN where `b` is."""
+        """The larger of two values; NaN where `b` is NaN."""
         return self.select(b <= a, a, b)
 
     def as_number(self, i: Value) -> Value:
-        """Integers, or bits, as the code's numbers: small ones, that do not round."""
+        """Integers, or bits, converted to doubles; the integers must be below 2⁵³."""
         if isinstance(i.it.type, ir.VectorType):
             convert = self.builder.uitofp if i.it.type.element == BIT else self.builder.sitofp
             return Value(self, convert(i.it, self.vector))
@@ -344,7 +344,7 @@ class Code:
     # ---- memory ----
 
     def element(self, base: Value, index, kind: ir.Type = DOUBLE) -> Value:
-        """The address of `base[index]`."""
+        """The address of `base[index]` in an array of type `kind`."""
         index = self.as_value(index, INTEGER)
         return self._append(f"getelementptr {kind}, {_typed(base)}, {_typed(index)}", base.it.type)
 
@@ -363,7 +363,7 @@ class Code:
         return variable
 
     def stack(self, words: int, align: int = 8) -> Value:
-        """The address of this many words of 8 bytes on the stack, which hold anything."""
+        """The address of uninitialised stack memory of `words` × 8 bytes."""
         with self.builder.goto_entry_block():
             place = self.builder.alloca(ir.ArrayType(INTEGER, words))
         place.align = align
@@ -377,7 +377,7 @@ class Code:
 
     @contextmanager
     def loop(self, stop, start=0) -> Iterator[Value]:
-        """Integers from `start` up to, without, `stop`."""
+        """A context that emits a loop: it yields the integers from `start` up to, excluding, `stop`."""
         counter = self.variable(self.as_value(start, INTEGER))
         with self.repeat_while(lambda: counter.value < stop, name=COUNTED):
             i = counter.value
@@ -385,18 +385,18 @@ class Code:
             counter.value = i + 1
 
     def fill(self, address: Value, count: "Value | int", number: float | int = 0.0) -> None:
-        """Set this many doubles, or integers, to a number."""
+        """Set `count` doubles (for a float `number`) or integers at an address to a number."""
         kind = DOUBLE if isinstance(number, float) else INTEGER
         with self.loop(self.as_value(count, INTEGER)) as i:
             self.store(self.as_value(number, kind), self.element(address, i))
 
     def copy(self, source: Value, address: Value, count: "Value | int") -> None:
-        """Copy this many doubles."""
+        """Copy `count` doubles from one address to another."""
         with self.loop(self.as_value(count, INTEGER)) as i:
             self.store(self.load(self.element(source, i), DOUBLE), self.element(address, i))
 
     def cases(self, number: Value, values: range) -> Iterator[int]:
-        """A switch: each of the `values` in turn, with the code written meanwhile for where `number` has it."""
+        """Emit a switch on an integer: yields each of `values`; the code emitted meanwhile is its case."""
         end = self.function.append_basic_block("end")
         switch = self.builder.switch(number.it, end)
         for value in values:
@@ -409,7 +409,7 @@ class Code:
 
     @contextmanager
     def repeat_while(self, condition, at_most: "Value | int | None" = None, name: str = "head") -> Iterator[None]:
-        """The body again and again, as long as `condition()` holds before it, `at_most` this many times."""
+        """A context that emits a loop while `condition()` holds before its body, of at most `at_most` rounds."""
         left = None if at_most is None else self.variable(self.as_value(at_most, INTEGER))
         head, body, done = (self.function.append_basic_block(name) for name in (name, "body", "done"))
         self.builder.branch(head)
@@ -424,11 +424,11 @@ class Code:
         self.builder.position_at_end(done)
 
     def count_up(self, counter: Value) -> Value:
-        """The integer at an address that all threads share, which grows by one."""
+        """Increment, atomically, an integer shared by all threads; its value before that."""
         return Value(self, self.builder.atomic_rmw("add", counter.it, ir.Constant(INTEGER, 1), "monotonic"))
 
     def only_if(self, condition: Value):
-        """A context: its body runs where the bit is set."""
+        """A context whose body is executed if the bit `condition` is set."""
         return self.builder.if_then(condition.it)
 
     def call(self, other: "Code", *arguments: Value) -> Value:
@@ -447,7 +447,7 @@ class Code:
         return self._call_by_name(full, kind, xs)
 
     def library(self, name: str, *xs: Value) -> Value:
-        """A function of the C library, on scalars or lane by lane: one evaluation a step serves all orders."""
+        """Call a function of the C library on scalars, or on each lane of vectors."""
         xs = self._match_types(*xs) if len(xs) == 2 else xs
         kind, number = xs[0].it.type, element_of(xs[0].it.type)
         _link_math_function(name)

@@ -1,4 +1,4 @@
-"""Loops and decisions over numbers, written in Python, as machine code: what JAX would trace anew for each scene.
+"""Loops and decisions over numbers, written in a subset of Python and compiled once, independent of the scene.
 
     @loop
     def total(x: Floats, count: int) -> float:
@@ -7,11 +7,11 @@
             found += x[i]
         return found
 
-A loop knows doubles, integers, arrays of both with one index, of which `x[3:]` is the part from there on, and the
-constants of its module. It has `if`, `while`, `for` over a range, arithmetic, comparisons, `and`, `or`, `not`, what
-stands in `_FUNCTIONS`, and calls of other loops. A variable keeps the kind that it begins with. It stays a function of
-Python, too, which computes the same on arrays of NumPy: so it is tested, and there an index outside of its array is an
-error, which machine code does not detect. Integers divide as those of C do.
+A loop may use doubles, integers, arrays of both with one index (`x[3:]` is the array from that element on) and the
+constants of its module; `if`, `while`, `for` over a range, arithmetic, comparisons, `and`, `or`, `not`, the functions
+in `_FUNCTIONS`, and calls of other loops. A variable keeps the type of its first value. The function can also be run by
+Python on NumPy arrays, with the same result: so it is tested, and there an index out of range is an error, which
+machine code does not detect. Integers divide as in C.
 """
 
 import ast
@@ -39,10 +39,10 @@ else:
 
 @dataclass(frozen=True, eq=False)
 class Struct:
-    """Named fields of an array, as an annotation: `places` has the integer of a `table` that says where each begins.
+    """The named fields of an array, used as an annotation: `places` maps a field to an integer in the array `table`.
 
-    The table is an argument of that name; without one the array is the table itself, of integers. Of `scalars` a field
-    is the number, of others the array from there on.
+    That integer is where the field begins; `table` is an argument of the loop. Without a table the array itself holds
+    these integers. A field in `scalars` is a number, any other one the array from there on.
     """
 
     places: dict[str, int]
@@ -60,7 +60,7 @@ _FUNCTIONS = ("abs", "min", "max", "float", "int", "sqrt", "cos", "sin", "log", 
 
 
 def evaluate(address: int, x: np.ndarray, out: np.ndarray) -> None:
-    """Call machine code `(x, out, rows)`, as of a straight line, on one row."""
+    """Call machine code `(x, out, rows)`, made for a straight line, on one row."""
     call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(int(address))
     call(x.ctypes.data, out.ctypes.data, 1)
 
@@ -68,7 +68,7 @@ def evaluate(address: int, x: np.ndarray, out: np.ndarray) -> None:
 def integrate(
     begin, plan, ts, y0, numbers, path, y_end, t_end, code, steps, rejected, changes, rest, members, times
 ) -> None:
-    """Run a kernel by its plan, with a row of times and of numbers for each member (`_handler.Handler.begin`)."""
+    """Run a kernel from its address `begin` and its `plan`, with one row of times and of parameters per member."""
     arrays = ts, y0, numbers, path, y_end, t_end, code, steps, rejected, changes, rest
     kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 12, *[ctypes.c_int64] * 4)
     kind(int(begin))(int(plan), *(x.ctypes.data for x in arrays), members, times, members, members)
@@ -84,7 +84,7 @@ def _parse_python(text: str, mode: str) -> Any:
 
 
 class Loop:
-    """A function of Python that may become machine code (`compile_loop`); a call runs it in Python."""
+    """A Python function in the subset, to be compiled by `compile_loops`; a call runs it in Python."""
 
     def __init__(self, function: Callable):
         self.function, self.name = function, function.__name__
@@ -94,7 +94,7 @@ class Loop:
         return self.function(*arguments)
 
     def bind(self, **names) -> "Loop":
-        """The same loop with other values of some names of its module."""
+        """The same loop with new values for some global names that it reads."""
         code, known = self.function.__code__, {**self.names, **names}
         return Loop(types.FunctionType(code, known, self.name, self.function.__defaults__))
 
@@ -125,7 +125,7 @@ _C_KINDS = {"int": ctypes.c_int64, "float": ctypes.c_double}
 
 @functools.cache
 def compile_loops(*entries: Loop) -> tuple[Callable, ...]:
-    """Loops as functions in machine code, which take numbers and addresses of arrays."""
+    """Compile loops together; the result are functions that take numbers and addresses of arrays."""
     names = tuple(entry.name for entry in entries)
     level, laws = LEVELS[0], [(entry.function.__module__, entry.name) for entry in entries]
     engine, places = compile_text(lambda: _write_module(entries), names, f"{_digest_sources(entries)} {laws}", level)
@@ -142,7 +142,7 @@ _engines: list = []  # which hold the code
 
 
 def _digest_sources(entries: tuple[Loop, ...]) -> str:
-    """A digest of the text of this package and of the files of these loops, with the constants that they read."""
+    """A digest of the sources of the package and of the files of these loops: the key of the compiled object."""
     digest, own = hashlib.sha256(), {Path(inspect.getfile(entry.function)) for entry in entries}
     for path in sorted({*Path(__file__).parents[2].rglob("*.py"), *own}):
         digest.update(path.read_bytes())
@@ -167,7 +167,7 @@ def _write_loop(module: ir.Module, of: Loop, written: dict) -> Code:
 
 
 class _LoopWriter:
-    """The instructions of one loop. What an expression yields is its kind, a key of `_KINDS`, and its value."""
+    """The code generator of one loop; an expression is a pair (type name, a key of `_KINDS`; value)."""
 
     def __init__(self, code: Code, of: Loop, write: Callable):
         self.code, self.of, self.write, self.builder = code, of, write, code.builder
@@ -360,7 +360,7 @@ class _LoopWriter:
         return kind, self.code.load(address, _KINDS[kind]) if is_scalar else address
 
     def field(self, node: ast.Attribute) -> tuple[str, Value]:
-        """The kind of a field, that of an array unless it is a scalar, and its address."""
+        """The type of a field (an array unless it is a scalar) and its address."""
         kind, base = self.value(node.value)
         struct = self.of.names.get(kind)
         if not isinstance(struct, Struct) or node.attr not in struct.places:
@@ -424,7 +424,7 @@ class _LoopWriter:
         return "bool", functools.reduce(Value.__and__, bits)
 
     def read_BoolOp(self, node: ast.BoolOp):
-        """Later parts are evaluated only where they matter."""
+        """Emit `and` or `or`: later operands are evaluated only if they decide the result."""
         result = self.code.variable(self.condition(node.values[0]))
         for x in node.values[1:]:
             goes_on = result.value if isinstance(node.op, ast.And) else ~result.value
@@ -433,7 +433,7 @@ class _LoopWriter:
         return "bool", result.value
 
     def read_IfExp(self, node: ast.IfExp):
-        """One of both is evaluated: the other may lie outside of an array."""
+        """Emit `a if c else b`: only one branch is evaluated, since the other may read outside of an array."""
         begins, ends, found = [], [], []
         blocks = [self.code.function.append_basic_block() for _ in range(3)]
         self.builder.cbranch(self.condition(node.test).it, *blocks[:2])

@@ -1,15 +1,15 @@
-"""Machine code kept on disk, so that a second process need not make it again.
+"""Compiled objects kept on disk, so that a second process need not compile them again.
 
-An object file is known by all that it was made from: the text of its module, the processor, what was done with the text
-and by which LLVM. Nothing of a process is in it: functions of the C library are called by name. Files are written under
-another name first and then renamed, so that any number of processes may read and write them at once; one that is cut
-short or damaged is not what its first bytes say, and is made anew. Where files cannot be read or written, nothing is
-kept, and nothing fails.
+The name of an object file is a digest of all it was made from: the text of its module, the processor, the passes and
+the version of LLVM. It has no addresses of a process: functions of the C library are called by name. A file is written
+under a temporary name and then renamed, so that any number of processes may read and write at once; a truncated or
+damaged file does not match the digest in its first bytes, and is made anew. Where files cannot be read or written,
+objects are not kept, and nothing fails.
 
-They lie in the user's folder for caches. The environment variable `LAGJAX_CACHE` names another one; `off` keeps none.
-What is read is run. So a folder is used only if it is the user's own and no other user may write to it; in another one,
-such as /tmp, a folder of its own is made, and without that nothing is kept, which one warning says. A file is read only
-if it is a regular one of the user's, with no link followed.
+They lie in the user's cache folder. The environment variable `LAGJAX_CACHE` names another folder; `off` keeps none. The
+objects are executed, so a folder is used only if it belongs to the user and no other user may write to it; in any other
+one, such as /tmp, a private subfolder is made, and if that fails nothing is kept and one warning is given. A file is
+read only if it is a regular file of the user, and no link is followed.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ _NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr
 
 
 def folder() -> Path | None:
-    """The folder of kept objects; None where none are kept."""
+    """The folder of kept objects; None if `LAGJAX_CACHE` turns that off."""
     chosen = os.environ.get("LAGJAX_CACHE", "")
     if chosen:
         return None if chosen.lower() in ("off", "0", "no", "false") else Path(chosen).expanduser()
@@ -54,7 +54,7 @@ def folder() -> Path | None:
 
 
 def private_folder(place: Path) -> Path | None:
-    """This folder, made if need be, where it is the user's alone; else one inside of it; None where neither can be."""
+    """This folder (created if missing) if only the user may write to it, else a private subfolder, else None."""
     inside = place / f"lagjax-{os.geteuid() if hasattr(os, 'geteuid') else 'user'}"
     for candidate in (place, inside):
         with contextlib.suppress(OSError):
@@ -67,7 +67,7 @@ def private_folder(place: Path) -> Path | None:
 
 
 def _is_private(status: os.stat_result) -> bool:
-    """True if a file or folder is the user's own, and no other user may write to it."""
+    """True if a file or folder belongs to the user and no other user may write to it."""
     if not hasattr(os, "geteuid"):  # Windows, where the folder for caches is the user's
         return True
     return status.st_uid == os.geteuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
@@ -83,7 +83,7 @@ def _warn_once(place: Path) -> None:
 
 
 def load_or_make(make: Callable[[], bytes], *made_from: str) -> bytes:
-    """The object that `make` returns, or the one that it returned for the same texts in this or another process."""
+    """The object kept for the texts `made_from`, or, if there is none, `make()`, which is then kept."""
     chosen = folder()
     place = None if chosen is None else private_folder(chosen)
     if place is None:
@@ -106,7 +106,7 @@ def load_or_make(make: Callable[[], bytes], *made_from: str) -> bytes:
 
 
 def _read_object(file: Path) -> bytes | None:
-    """The bytes that were written to a file; None where there is none, it is damaged, or may be somebody else's."""
+    """The bytes of an object file; None if it is missing, damaged, or not private to the user."""
     try:
         number = os.open(file, os.O_RDONLY | _NO_LINK)
         with os.fdopen(number, "rb") as opened:
@@ -138,7 +138,7 @@ def _write_object(file: Path, body: bytes) -> None:
 
 
 def _remove_oldest(place: Path) -> None:
-    """Remove the files that were not used for longest where all together are too large."""
+    """Remove the least recently used files if the total size exceeds its limit."""
     files = []
     with os.scandir(place) as entries:
         for entry in entries:

@@ -1,17 +1,17 @@
 """The reverse-mode derivative of a batch of motions: the transpose of every step, from the last to the first.
 
-The transpose of a step takes a cotangent λ of the state at its end to one at its beginning, and adds to the cotangents
-of the parameters: the pullbacks of its maps (`_maps`), from the last to the first:
+The transpose of a step maps a cotangent λ of the state at its end to one at its start, and adds to the cotangents of
+the parameters. It is the pullbacks of the maps of the step (`_maps`), from the last to the first:
 
     saltation      to the near side of the border that the step ends at;  the projection, to the end of the series
     sum            ȳₖ = hᵏ λ, and sᵏ times the cotangent of every output within the step, at t + s
     orders         from the last to the first: the Cauchy products, then the recursion
     zeroth order   to λ = ȳ₀
 
-Every number it takes is one of the step itself, so the series is made once more from the recorded state. The cost is
-that of two or three motions, however many parameters there are. Steps are those that were taken: as everywhere in
-diffrax, their sizes are not differentiated. `excess` estimates whether they suit derivatives (see `_tangent`), from
-what the transpose has at hand: the rates of the tangents, and the series that are multiplied.
+The pullbacks need the numbers of the step, so the series is computed again from the recorded state. The cost is that of
+two or three motions, for any number of parameters. Steps are those that were taken: as everywhere in diffrax, their
+sizes are not differentiated. `excess` estimates whether they are accurate for derivatives (see `_tangent`), from the
+rates of the tangents and the series that are multiplied.
 """
 
 from lagjax._native.code._constants import NEAR_ZERO
@@ -31,7 +31,7 @@ JOB = job(
 
 
 class Adjoint:
-    """Builds the module; its public functions are `begin(job, memory, lanes)` and `run(job, memory, lanes, rounds)`."""
+    """The module of an adjoint, with public functions `begin(job, memory, lanes)` and `run(…, rounds)`."""
 
     job = JOB
 
@@ -61,7 +61,7 @@ class Adjoint:
     # ---- rounds ----
 
     def _run_function(self, steps: list[Code]) -> None:
-        """`run(job, memory, lanes, rounds)`: one step back in every lane a round; 1 if there is more to do."""
+        """Emit `run(job, memory, lanes, rounds)`: one step back per lane and round; 1 if there is more to do."""
         frame = self.motion.function("run", INTEGER, result=INTEGER, public=True)
         with self.replay.rounds(frame, frame.arguments[0], self._advance_step):
             for step in steps:
@@ -102,7 +102,7 @@ class Adjoint:
     # ---- the transpose of a step ----
 
     def _transpose_orders(self, back_products: Code, back_recursion: Code) -> Code:
-        """The transposes of the Cauchy products, then of the recursion, from the last order to the first."""
+        """Emit the transposes of the Cauchy products and the recursion, from the last order to the first."""
         frame = self.motion.function("back_orders")
         code, order = frame.code, frame.job("order")
         measured = self._last_terms()
@@ -116,7 +116,7 @@ class Adjoint:
         return frame.finish()
 
     def _last_terms(self) -> Code:
-        """The bound of the last terms of the series of a tangent, from the transpose of the last order."""
+        """Emit the bound of the last terms of a tangent's series, from the transpose of the last order."""
         frame = self.motion.function("measured")
         code, form, n, order = frame.code, self.motion.form, self.motion.n, frame.job("order")
         h, p = code.lanes_of(abs(frame["h"])), code.as_number(frame.job("order"))

@@ -1,11 +1,11 @@
-"""A straight line as functions of C99, whose digits are those of its machine code (`_line_handler`).
+"""A straight line as functions of C99 that give the same digits as its machine code (`_line_handler`).
 
-Every operation is written as it stands in the line. A compiler that leaves floats as they are (`-ffp-contract=off`, no
-`-ffast-math`) gives the same digits. Sine and cosine of one angle are computed together, by the polynomials of
-`_lanes`; other functions are those of `math.h`.
+Every operation is written in the order of the line. A compiler that does not rearrange floating-point operations
+(`-ffp-contract=off`, no `-ffast-math`) gives the same digits. Sine and cosine of one angle are computed together, by
+the polynomials of `_lanes`; other functions are those of `math.h`.
 
-A compiler takes longer than in proportion to the length of a function. A long line is therefore divided into several
-functions, and a value that a later one reads stands in an array `w`.
+The time of a compiler grows faster than the length of a function. A long line is therefore divided into several
+functions, and a value that a later one reads is stored in an array `w`.
 """
 
 import math
@@ -36,7 +36,7 @@ _WHOLE_FORMS = {
 _FORMS_OF_ALL = frozenset(("add", "sub", "mul", "neg", "select", "and", "or", "xor"))
 
 _ZEROS = re.compile(r"\.?0+p")
-_LITERAL, _CALL = re.compile(r"\d+\.\d+"), re.compile(r"\b(?!maximum|minimum)([a-z][a-z0-9]*)\(")
+_LITERAL, _CALL = re.compile(r"\d+\.\d+"), re.compile(r"\b(?!maximum|minimum|logaddexp)([a-z][a-z0-9]*)\(")
 
 # What a line may call, by name. `maximum` and `minimum` are those of LLVM: NaN where one number is, and 0 above −0.
 _HELPERS = {
@@ -45,6 +45,12 @@ static double maximum(double a, double b) { return a > b ? a : b > a ? b : a == 
 """,
     "minimum": """\
 static double minimum(double a, double b) { return a < b ? a : b < a ? b : a == b ? (signbit(a) ? a : b) : a + b; }
+""",
+    "logaddexp": """\
+static double logaddexp(double a, double b)
+{
+    return (a > b ? a : b) + (a == b ? log1p(1.0) : log1p(exp(-fabs(a - b))));
+}
 """,
     "take": """\
 /* The entry of a table with the whole number x. */
@@ -92,7 +98,7 @@ _SINGLE_TURN = "static void turn(float x, float *sine, float *cosine) { *sine = 
 
 
 class CNumbers(NamedTuple):
-    """The numbers of C in one precision: "float64" as double, "float32" as float."""
+    """The number type of C for a precision: double for "float64", float for "float32"."""
 
     dtype: str
 
@@ -105,18 +111,18 @@ class CNumbers(NamedTuple):
         return "float" if self.is_single else "double"
 
     def constant(self, x: float) -> str:
-        """A number, exact, in hexadecimal digits."""
+        """A number as an exact hexadecimal constant of C."""
         if math.isnan(x):
             return "NAN"
         text = "INFINITY" if math.isinf(x) else _ZEROS.sub("p", abs(x).hex()) + "f" * self.is_single
         return f"(-{text})" if math.copysign(1.0, x) < 0 else text
 
     def form(self, expression: str) -> str:
-        """An expression of functions and numbers of doubles, in this precision."""
+        """An expression of double functions and constants, converted to this precision."""
         return _LITERAL.sub(r"\g<0>f", _CALL.sub(r"\1f(", expression)) if self.is_single else expression
 
     def helpers(self, text: str) -> list[str]:
-        """The functions that this text calls."""
+        """The helper functions that this text calls, as C."""
         parts, quarters = [self.constant(x) for x in PI_2], self.constant(1 / PI_2_ROUNDED[0])
         settings = {"largest": self.constant(LARGEST_ANGLE), "quarters": quarters, "parts": parts}
         turn = _TURN.format(**settings, sine=self._polynomial(SIN), cosine=self._polynomial(COS))
@@ -133,9 +139,9 @@ class CNumbers(NamedTuple):
 def write_function(
     name: str, line: StraightLine, arguments: dict[str, str], read: Callable[[int], str], numbers: CNumbers
 ) -> str:
-    """The function `name(arguments, out)` in C; input i of the line is `read(i)`. Raises `Unlowerable`.
+    """The C text of `name(arguments, out)`; input i of the line is `read(i)`. Raises `Unlowerable`.
 
-    `arguments` are types by name.
+    `arguments` maps names to types.
     """
     kind, parts = numbers.type, _FunctionParts(name, line, read, numbers)
     given = ", ".join(arguments)
@@ -152,7 +158,7 @@ def write_function(
 
 
 class _FunctionParts:
-    """The statements of a line as `bodies` of functions, the `room` that these share, and the `tables` they read."""
+    """The statements of a line in `bodies` of several functions, the size `room` of the shared array, and `tables`."""
 
     def __init__(self, name: str, line: StraightLine, read: Callable[[int], str], numbers: CNumbers):
         self.name, self.line, self.read, self.numbers = name, line, read, numbers
@@ -171,7 +177,7 @@ class _FunctionParts:
             self.bodies.append("".join(f"    {statement}\n" for statement in self.text))
 
     def _find_inlined(self) -> list[bool]:
-        """Flags of the nodes that stand where they are used: constants, and arithmetic of one use."""
+        """For each node: True if its expression is written where it is used (constants, arithmetic used once)."""
         nodes, size = self.line.nodes, [1] * len(self.line.nodes)
         inlined, repeated = [False] * len(nodes), set(self.line.outputs)
         for op, operands, _ in nodes:
@@ -186,7 +192,7 @@ class _FunctionParts:
         return inlined
 
     def _last_readers(self, named: list[int]) -> dict[int, int]:
-        """The last part that reads each node with a name."""
+        """For each named node, the last function that reads it."""
         last = dict(self.home)
         for i in named:
             waiting = list(self.line.nodes[i][1])
@@ -236,7 +242,7 @@ class _FunctionParts:
         self.text.append(f"const {kinds[self.line.kinds[i]]} v{i} = {expression};")
 
     def _operand(self, i: int) -> str:
-        """The name of a node, or its expression; what stands in another part is read here first."""
+        """The name of a node, or its expression; a value of another function is first read from the array."""
         op, _, attribute = self.line.nodes[i]
         if op == "constant":
             is_float = self.line.kinds[i] == "float"
@@ -265,7 +271,7 @@ class _FunctionParts:
         return self.numbers.form(OPERATIONS[op].write_c(*places, attribute=attribute)).format(*xs)
 
     def _look_up(self, op: str, attribute, x: str) -> str:
-        """A look-up in a table of parameters, or of numbers of the line."""
+        """The expression of a look-up in a table of parameters or of constants."""
         table = table_of(attribute)
         if table.numbers is None:
             where, stride = f"&{self.read(table.first)}", table.stride

@@ -1,10 +1,10 @@
-"""First derivatives of a few short motions as calls of XLA, without Python.
+"""First derivatives of few short motions in one call of XLA, without Python.
 
-    run again, with the steps written down ─► in the order of the members ─► forward along directions, or back
+    run again with steps recorded ─► sort the steps by member ─► tangents along directions, or cotangents
 
-A motion that takes less time than Python does is run once more rather than have its steps travel through a program of
-JAX. Nothing is continued here: where the rounds of the plan are not enough, or a member does not reach its end, the
-handler says that it is not done, and its caller takes another way.
+A motion that takes less time than a call of Python is computed again instead of passing its steps through a JAX
+program. The handler does not resume: if the rounds of the plan do not suffice, or a member does not reach its end, it
+returns "not done", and the caller uses the general path.
 """
 
 import ctypes
@@ -26,9 +26,10 @@ _NUMBERS = ("states", "numbers", "order", "max_steps", "rounds", "room", "direct
 
 
 class DerivativePlan(ctypes.Structure):
-    """The plan of a handler: the functions of both kernels, doubles and integers of a thread of each, and how to run.
+    """The plan of a handler: functions of both kernels, sizes of their memories, and the settings of the run.
 
-    `room` steps are written down; `rounds` are those of the motion, `others` doubles of a member in the second result.
+    Up to `room` steps are recorded; `rounds` are those of the motion, `others` the doubles per member of the second
+    result.
     """
 
     _fields_ = [
@@ -38,14 +39,14 @@ class DerivativePlan(ctypes.Structure):
     ]
 
     def scratch(self, members: int, times: int) -> int:
-        """The doubles that a handler needs for itself."""
+        """The size, in doubles, of the scratch memory of a handler."""
         rows = 2 * self.room * (self.states + RECORDED)
         for_members = members * (times * self.states + self.states + 4 + 2)
         return rows + for_members + _COUNTERS + sum(getattr(self, name) for name in _SIZES) + 2 * CACHE_LINE
 
 
 class Kind(NamedTuple):
-    """A derivative: the structure of its job; its fields for the third argument, the first result and the second."""
+    """A kind of derivative: its job structure, and which fields take the third argument and the two results."""
 
     job: type
     argument: str
@@ -63,19 +64,19 @@ ARGUMENTS, RESULTS = ("ts", "y0", "params", "argument", "start"), ("first", "sec
 
 @make_once
 def derivative_handler(kind: str) -> int:
-    """The address of XLA's handler for the `kind` "jvp" or "vjp", made at the first call.
+    """The address of XLA's handler for the `kind` "jvp" or "vjp", compiled at the first call.
 
     Its arguments are `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P), then for "jvp" the tangents of the
     parameters (N, m, P) and of the states (N, m, 2n), for "vjp" the cotangents of the outputs (N, T, 2n) and of the end
     (N, 2n). Its results are the tangents of the end and of the outputs (N, m, T, 2n), or the cotangents of the states
-    and of the parameters (N, P); `excess` (N,); `done`, 1 or 0; and what it needs for itself.
+    and of the parameters (N, P); `excess` (N,); `done`, 1 or 0; and scratch memory.
     """
     write = lambda module: _DerivativeCode(module, KINDS[kind]).finish()  # noqa: E731
     return compile_handler(kind, len(ARGUMENTS), len(RESULTS), write)["handler"]
 
 
 class _DerivativeCode(PlanCode):
-    """Writes down `derivative(plan, *arguments, *results, members, times, rows of ts, rows of params)`."""
+    """Emits `derivative(plan, *arguments, *results, members, times, rows of ts, rows of params)`."""
 
     def __init__(self, module: ir.Module, kind: Kind):
         super().__init__(module, "derivative", DerivativePlan, (*ARGUMENTS, *RESULTS))
@@ -90,7 +91,7 @@ class _DerivativeCode(PlanCode):
             code.store(code.select(code.compare("==", more, 0), code.as_value(1.0, DOUBLE), 0.0), done)
 
     def _place_arrays(self) -> None:
-        """Give every array of the scratch its place: the memories of both kernels first, on cache lines, of zeros."""
+        """Divide the scratch memory among its arrays: first the memories of both kernels, cache-aligned and zeroed."""
         code, known, scratch = self.code, self.known, self.known["scratch"]
         end, rows = code.element(scratch, self.skipped(scratch)), known["room"] * (known["states"] + RECORDED)
         members = known["members"]
@@ -115,7 +116,7 @@ class _DerivativeCode(PlanCode):
         return self.code.element(self.at["counters"], i, INTEGER)
 
     def _run_motions(self) -> Value:
-        """Run the motions, with their steps written down; whether all reached their end."""
+        """Run the motions and record their steps; the flag that all reached their end."""
         code, place = self.code, self.at
         fields = place | dict(record=place["rows"], next_member=self._new_counter(0), next_row=self._new_counter(1))
         memory = place["memory"], place["lane_integers"], self._new_counter(2)
@@ -128,7 +129,7 @@ class _DerivativeCode(PlanCode):
         return well.value > 0
 
     def _sort_steps(self) -> None:
-        """Sort the rows of the steps by member."""
+        """Sort the recorded steps by member."""
         code, place, width = self.code, self.at, self.known["states"] + RECORDED
         first = code.variable(code.as_value(0, INTEGER))
         with code.loop(self.known["members"]) as i:
@@ -150,7 +151,7 @@ class _DerivativeCode(PlanCode):
         code.fill(known["excess"], known["members"])
 
     def _differentiate_steps(self) -> Value:
-        """The derivative over the steps; 1 if there is more to do."""
+        """Run the derivative over the recorded steps; 1 if there is more to do."""
         known, place, kind = self.known, self.at, self.kind
         fields = {kind.argument: known["argument"], kind.first: known["first"], kind.second: known["second"]}
         fields |= dict(record=place["record"], first_step=place["first_step"], steps=place["counts"])

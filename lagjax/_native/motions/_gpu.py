@@ -1,16 +1,15 @@
-"""The motion of a kernel, and its transpose, as programs for NVIDIA GPUs: one thread a member.
+"""The motion of a kernel, and its adjoint, as programs for NVIDIA GPUs: one thread per member.
 
-The modules of one lane that run on a CPU go, unchanged, through LLVM's target for PTX, the assembly language that the
-driver turns into machine code. An entry (`_gpu_entry`) builds the job on the stack of its thread and calls their
-`begin` and `run`; a thread whose member has ended takes the next one from the counter that all share. Functions that
-are no instruction come from libdevice, NVIDIA's library in LLVM's own form, which lies where pip has put
-`nvidia-cuda-nvcc`: `jax[cuda12]` depends on it.
+The one-lane modules that run on a CPU are compiled, unchanged, by LLVM's target for PTX, the assembly language that the
+driver translates. An entry (`_gpu_entry`) builds the job on the stack of its thread and calls their `begin` and `run`;
+a thread whose member has ended takes the next one from a shared counter. Mathematical functions come from libdevice,
+NVIDIA's library as LLVM bitcode, which is installed with the package `nvidia-cuda-nvcc`: `jax[cuda12]` depends on it.
 
-A program has one of two forms. Where the coefficients of a motion are few, the loops over orders are unrolled, at an
-order that is lower than a CPU's if that keeps them few: no array is left, and the coefficients are registers, some of
-which the assembler spills. Otherwise they stand in the memory of the thread.
+A program has one of two forms. If a motion has few coefficients, the loops over orders are unrolled, at an order lower
+than a CPU's if that keeps them few: then the coefficients are registers instead of arrays, though the assembler spills
+some. Otherwise they are in the memory of the thread.
 
-What is here needs no GPU: it is assembled and checked on CPUs. `benchmarks.gpu` runs it on one.
+This file needs no GPU: its programs are assembled and checked on CPUs. `benchmarks.gpu` runs them on one.
 """
 
 import functools
@@ -53,10 +52,10 @@ _lock = threading.Lock()
 
 
 class GpuPrograms:
-    """The programs for GPUs of a kernel, made on first use.
+    """The GPU programs of a kernel, compiled on first use.
 
-    `motion` and `adjoint` write down the modules of one lane. The tolerance chooses the order of the series. All raise
-    `Unlowerable`, whose text says why, where a GPU cannot run the program.
+    `motion` and `adjoint` make the modules of one lane. The tolerance determines the order of the series. Methods raise
+    `Unlowerable`, with the reason, if a GPU cannot run the program.
     """
 
     def __init__(self, motion: Callable[[], TaylorSeries], adjoint: Callable[[], TaylorSeries]):
@@ -72,7 +71,7 @@ class GpuPrograms:
         return self._motion(self.form(MOTION, rtol))
 
     def transpose(self, rtol: float) -> tuple[str, int]:
-        """The motion of a member and back in PTX, and the doubles that are written down of a step."""
+        """The PTX of the motion and adjoint of a member, and the number of doubles recorded per step."""
         return self._transpose(self.form(TRANSPOSE, rtol)), self._lane().row
 
     def _assemble_motion(self, form: GpuForm) -> str:
@@ -80,7 +79,7 @@ class GpuPrograms:
             return _compile_ptx(motion_entry(self._lane(), form.order), [_parse_module(self._lane(), form)])
 
     def _assemble_transpose(self, form: GpuForm) -> str:
-        """The PTX of an integrator and of its adjoint, one after the other in one thread."""
+        """The PTX in which one thread runs an integrator, then its adjoint."""
         lane, back = self._lane(), self._lane_back()
         require_room(lane.size + back.size if form.unrolled else max(lane.size, back.size))
         with _lock:
@@ -91,7 +90,7 @@ class GpuPrograms:
 
 
 def form_for(entry: Entry, lane: OneLane, order: int) -> GpuForm:
-    """The form of a motion that should take the least time, where a CPU takes series of this `order`."""
+    """The form expected to be fastest for a motion whose series has this `order` on a CPU."""
     fitting = MOST_COEFFICIENTS[entry] // lane.series
     return GpuForm(order, False) if lane.large or fitting < LEAST_ORDER else GpuForm(min(order, fitting), True)
 
@@ -101,7 +100,7 @@ def grid(entry: Entry, members: int) -> tuple[int, int]:
 
 
 def require_room(doubles: int) -> None:
-    """Raise `Unlowerable` where a thread cannot remember this many numbers, which may be part of a motion's."""
+    """Raise `Unlowerable` if a thread cannot hold this many doubles, a lower bound of what a motion needs."""
     if 8 * doubles > LARGEST_THREAD:
         raise Unlowerable(
             f"a thread of a GPU would have to remember at least {8 * doubles} bytes of a motion, "
@@ -110,7 +109,7 @@ def require_room(doubles: int) -> None:
 
 
 def one_lane(motion: TaylorSeries) -> OneLane:
-    """The module of a motion. Raises `Unlowerable`, whose text says why a GPU cannot run it."""
+    """The one-lane module of a motion. Raises `Unlowerable` with the reason why a GPU cannot run it."""
     assert motion.width == 1, "a thread follows one member"
     require_room(motion.layout.size)
     if motion.look_up.numbers is not None:
@@ -149,10 +148,10 @@ def _compile_ptx(entry: str, parts: Sequence[llvm.ModuleRef]) -> str:
 
 
 def _refuse_far_angles() -> llvm.ModuleRef:
-    """A module in which the sine of an angle beyond 2**20 is NaN.
+    """A module whose sine and cosine are NaN beyond angles of 2**20.
 
-    A step to there is refused, so that the motion ends and says so. libdevice has such sines, with a reduction that
-    every thread would keep room for.
+    A step to such an angle is rejected, so that the motion ends with an error. libdevice's own reduction of large
+    angles would take memory in every thread.
     """
     module = ir.Module("far_angles")
     module.triple = ""
@@ -163,7 +162,7 @@ def _refuse_far_angles() -> llvm.ModuleRef:
 
 
 def _inline_functions(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> llvm.ModuleRef:
-    """The module with its functions in one another, and its loops as they are but for those that ask to be unrolled."""
+    """The module with all functions inlined; loops are unrolled only where metadata demand it."""
     for function in module.functions:
         if not function.is_declaration and function.name != "integrate":
             function.add_function_attribute("alwaysinline")
@@ -186,7 +185,7 @@ def _gpu_target() -> llvm.Target:
 
 @functools.cache
 def libdevice() -> bytes | None:
-    """NVIDIA's library of functions, as pip or CUDA's own installer has put it; None where it is not."""
+    """The bitcode of NVIDIA's function library, as installed by pip or CUDA; None if it is not found."""
     toolkits = [os.environ[name] for name in ("CUDA_HOME", "CUDA_PATH") if name in os.environ] + ["/usr/local/cuda"]
     places = [(folder or ".", "nvidia/*/nvvm") for folder in sys.path] + [(folder, "nvvm") for folder in toolkits]
     for folder, inside in places:

@@ -1,10 +1,10 @@
-"""The entries of programs for GPUs: what a thread does with the members that it takes.
+"""The entry functions of GPU programs: the loop of a thread over the members that it takes.
 
-    MOTION       follow them, one after the other, until the counter that all threads share is at the end
-    TRANSPOSE    of each: follow it with its steps written down, and go back over these from the last to the first
+    MOTION       integrate members, one after another, until the shared counter is at the end
+    TRANSPOSE    for each: integrate it and record its steps, then transpose these from the last to the first
 
-The steps of a transpose stand in a record that is the thread's own and serves one member after the other, so that the
-memory does not grow with their number. A member with more steps than the record has `room` for is not `done`.
+The steps of a transpose are kept in a record of the thread, reused for each member, so that memory does not grow with
+the number of members. A member with more steps than the record has `room` for is not `done`.
 """
 
 import ctypes
@@ -27,10 +27,10 @@ _KINDS = {name: DOUBLE if kind is ctypes.c_double else INTEGER for name, kind in
 
 
 class Entry(NamedTuple):
-    """A kernel by the names of its arguments and results, in their order, and of its `numbers`, which are one argument.
+    """A GPU kernel: the names of its arguments and results, in order, and of its `numbers`, passed as one argument.
 
-    Arguments and results are the addresses of arrays of doubles, but for the words of `numbers` and the counter
-    `next_member`. A result that is an argument, too, is written to where that lies.
+    Arguments and results are addresses of arrays of doubles, except the words of `numbers` and the counter
+    `next_member`. A result that is also an argument is written in place.
     """
 
     arguments: tuple[str, ...]
@@ -39,11 +39,11 @@ class Entry(NamedTuple):
 
     @property
     def aliases(self) -> dict[int, int]:
-        """The places of arguments that are results, too: of each as an argument, and as a result."""
+        """The positions {argument: result} of arrays that are both."""
         return {self.arguments.index(name): k for k, name in enumerate(self.results) if name in self.arguments}
 
     def words(self, **numbers: float) -> list[int]:
-        """The entry's numbers as whole numbers of 64 bits: doubles by their bits."""
+        """The entry's numbers as 64-bit integers: doubles by their bits."""
         kinds: dict[str, Callable] = dict(_integrator.JOB._fields_)
         return [ctypes.c_int64.from_buffer_copy(kinds[name](numbers[name])).value for name in self.numbers]
 
@@ -62,14 +62,14 @@ TRANSPOSE = Entry(
 
 
 class GpuForm(NamedTuple):
-    """The order of the series, and whether the loops over orders are `unrolled`."""
+    """The form of a GPU program: the order of the series, and whether loops over orders are `unrolled`."""
 
     order: int
     unrolled: bool
 
 
 class OneLane(NamedTuple):
-    """The module of a motion in one lane: its text, and what an entry and the choice of a form must know of it."""
+    """The one-lane module of a motion: its text, and the sizes that an entry and the choice of a form need."""
 
     text: str
     size: int  # doubles that a thread remembers
@@ -82,7 +82,7 @@ class OneLane(NamedTuple):
 
     @classmethod
     def from_motion(cls, motion: TaylorSeries) -> "OneLane":
-        """The module of an integrator or of an adjoint, whose motion is finished."""
+        """The one-lane module of a finished integrator or adjoint."""
         states, text = motion.states, str(motion.module)
         row, series = states + RECORDED + motion.recorded_pieces, states + motion.series.rows
         if not motion.large:
@@ -92,7 +92,7 @@ class OneLane(NamedTuple):
 
 
 def motion_entry(motion: OneLane, order: int) -> str:
-    """The module of `MOTION`, `integrate(*arguments, *results)`: it calls the `begin` and `run` of an `_integrator`."""
+    """The module of `MOTION`, `integrate(*arguments, *results)`: it calls `begin` and `run` of an `_integrator`."""
     thread = _IntegrateEntry(MOTION)
     job = job_of(thread.code, _integrator.JOB, thread.at | thread.numbers | {"order": integer(thread.code, order)})
     thread.run("", motion, job, thread.memory(motion.size), thread.code.stack(1))
@@ -100,7 +100,7 @@ def motion_entry(motion: OneLane, order: int) -> str:
 
 
 def transpose_entry(motion: OneLane, adjoint: OneLane, form: GpuForm) -> str:
-    """The module of `TRANSPOSE`: it calls an integrator, and an `_adjoint` by the names `begin_back` and `run_back`."""
+    """The module of `TRANSPOSE`: it calls an integrator, and an `_adjoint` as `begin_back` and `run_back`."""
     return _TransposeEntry(motion, adjoint, form).finish()
 
 
@@ -128,7 +128,7 @@ class _IntegrateEntry:
         return self.code.stack(doubles, align=8 * CACHE_LINE)
 
     def run(self, name: str, motion: OneLane, job: Value, memory: Value, *more: Value) -> None:
-        """Begin and run the members of a job, all of them, in a memory that is cleared before."""
+        """Emit a call that integrates all members of a job, in a memory that is zeroed before."""
         bits = ir.Constant(ir.IntType(8), 0), integer(self.code, 8 * motion.size), ir.Constant(BIT, 0)
         self._call_function("llvm.memset.p0.i64", memory, *bits)
         self._call_function(f"begin{name}", job, memory, self.lanes)
@@ -151,7 +151,7 @@ class _IntegrateEntry:
 
     @contextmanager
     def members(self) -> Iterator[Value]:
-        """A context: its body is for every member that the thread takes."""
+        """A context: its body is emitted as a loop over the members that the thread takes."""
         code, counter = self.code, self.at["next_member"]
         member = code.variable(code.count_up(counter))
         with code.repeat_while(lambda: member.value < self.numbers["members"]):
@@ -160,7 +160,7 @@ class _IntegrateEntry:
 
 
 class _TransposeEntry(_IntegrateEntry):
-    """Writes down `transpose_entry`."""
+    """Emits the kernel of `transpose_entry`."""
 
     def __init__(self, motion: OneLane, adjoint: OneLane, form: GpuForm):
         super().__init__(TRANSPOSE)
@@ -198,7 +198,7 @@ class _TransposeEntry(_IntegrateEntry):
                           excess=member_address("excess", 1))  # fmt: skip
 
     def _follow_motion(self, ts: Value, y0: Value, params: Value) -> None:
-        """The motion from the first output time to the last one, with its steps written down."""
+        """Emit the integration of a member from the first to the last output time, with its steps recorded."""
         code, own = self.code, self.own
         for i, time in enumerate((integer(self.code, 0), self.numbers["times"] - 1)):
             code.store(code.load(code.element(ts, time), DOUBLE), code.element(self.ends, i))
@@ -209,7 +209,7 @@ class _TransposeEntry(_IntegrateEntry):
         self.run("", self.motion, job_of(code, _integrator.JOB, fields), self.memories[0], own["idle"])
 
     def _transpose_steps(self, **arrays: Value) -> None:
-        """The transposes of the steps that were written down, from the last one."""
+        """Emit the transposes of the recorded steps, from the last one."""
         code, own = self.code, self.own
         taken = code.as_integer(code.load(own["steps"], DOUBLE))
         for name, start in (("next_member", 0), ("first_step", 0), ("steps_back", taken)):

@@ -1,13 +1,13 @@
-"""The integration of a few members as a call of XLA's typed foreign-function interface: no Python, no lock, no thread.
+"""The integration of few members in a call of XLA's foreign-function interface: no Python, no lock, no thread.
 
-XLA calls a handler with a frame, in which are the addresses of the arguments, of the results and of one attribute: that
-of a `Plan`, which says whose machine code is to run, how and how far. One handler serves all kernels. It never waits:
-it begins a run, does as many rounds as take a slice of time, and leaves behind what is needed to continue (`Rest`). The
-caller looks at the rest, and at how members ended; all that is rare stays in Python. Outside of XLA a `Kernel` begins
-in the same way, with one call.
+XLA calls a handler with a frame that has the addresses of arguments, results and one attribute: that of a `Plan`, which
+tells which machine code to run, and for how long. One handler serves all kernels. It does not block: it starts a run,
+does as many rounds as take one time slice, and returns what is needed to resume (`Rest`). The caller checks whether the
+run is complete, and how members ended; all rare cases are handled in Python. Outside of XLA a `Kernel` starts in the
+same way, with one call.
 
 Layouts of structures are those of `xla/ffi/api/c_api.h`, on 64 bits. `unavailable` compares its version with that of
-the header that came with the XLA at hand.
+the header of the installed XLA.
 """
 
 import ctypes
@@ -33,9 +33,9 @@ _DATA, _DIMS, _SCALAR_VALUE = 24, 40, 8
 
 
 def unavailable(include: str) -> str | None:
-    """Why handlers cannot be made for the XLA whose headers are in this folder; None where they can.
+    """The reason why handlers cannot be used with the XLA whose headers are in this folder; None if they can.
 
-    By what the header says, structures keep their fields, and these their places, under one major version.
+    The header guarantees that structures keep the offsets of their fields within a major version.
     """
     header = Path(include) / "xla" / "ffi" / "api" / "c_api.h"
     if ctypes.sizeof(ctypes.c_void_p) != 8:
@@ -50,7 +50,7 @@ def unavailable(include: str) -> str | None:
 
 
 class Plan(ctypes.Structure):
-    """The plan of a kernel: its functions, doubles of `memory` of a thread, and how to run, for `rounds` at first."""
+    """The plan of a kernel: its functions, the size of a thread's `memory`, the settings, and the first `rounds`."""
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("begin", "run")),
@@ -62,9 +62,9 @@ class Plan(ctypes.Structure):
 class Rest(NamedTuple):
     """The state of a run that a handler left unfinished: the memory of the thread and its integers.
 
-    As an array of doubles, `size` of them, it begins with the memory, after as many doubles as are left before the next
-    boundary of a cache line. At the end stand integers of 64 bits: those of the lanes, how many doubles were left, the
-    idle steps of lanes, the next member, and 1 if there is more to do.
+    As an array of `size` doubles it has some unused ones, up to the next cache line, then the memory, and at the end
+    64-bit integers: those of the lanes, the number of unused doubles, the idle steps of lanes, the next member, and 1
+    if the run is unfinished.
     """
 
     memory: np.ndarray
@@ -78,7 +78,7 @@ class Rest(NamedTuple):
 
     @classmethod
     def from_array(cls, array: np.ndarray, layout: Memory) -> "Rest":
-        """A copy of the rest that a handler wrote."""
+        """A copy of the rest that a handler wrote as an array."""
         integers = array[-_INTEGERS:].view(np.int64).copy()
         lanes, (skipped, *_) = np.split(integers, [-_OTHERS])
         memory = allocate_aligned(layout.size)
@@ -87,7 +87,7 @@ class Rest(NamedTuple):
 
     @staticmethod
     def counts(array: np.ndarray) -> list[int]:
-        """The idle steps of lanes, the next member, and whether there are more, by the rest that a handler wrote."""
+        """The idle steps of lanes, the next member, and 1 if the run is unfinished, from a rest as an array."""
         return array[-3:].view(np.int64).tolist()
 
 
@@ -105,14 +105,14 @@ RESULTS: tuple[str, ...] = ("path", "y_end", "t_end", "code", "steps", "rejected
 
 
 class Handler:
-    """Two functions in machine code: `address` is where XLA's handler is.
+    """The compiled handler: `address` is that of XLA's handler function.
 
     Its arguments are `ts` (1 or N, T), `y0` (N, 2n) and `params` (1 or N, P), its results `path` (N, T, 2n), `y_end`
     (N, 2n), then `t_end`, `code`, `steps` and `rejected`, each (N,), the `changes` of guards (N, G), and the `rest` of
-    the run (`Rest.size`), all of doubles. `path` is NaN where a member did not come.
+    the run (`Rest.size`), all of doubles. `path` is NaN at times that a member did not reach.
 
     `begin` does the same for Python: it takes the addresses of a plan, of the arguments and of the results, then N, T
-    and how many rows `ts` and `params` have.
+    and the numbers of rows of `ts` and `params`.
     """
 
     def __init__(self):
@@ -123,7 +123,7 @@ class Handler:
 
 
 def make_once(make: Callable) -> Callable:
-    """A decorator: the function is called once in a process for the same arguments, by one thread at a time."""
+    """A decorator: the result is cached for the life of the process, and computed by one thread at a time."""
     lock, cached = threading.Lock(), functools.cache(make)
 
     @functools.wraps(make)
@@ -143,10 +143,10 @@ def handler() -> Handler:
 
 
 def compile_handler(name: str, arguments: int, results: int, write: Callable, *public: str) -> dict[str, int]:
-    """The addresses of a `handler`, `XLA_FFI_Error* (XLA_FFI_CallFrame*)`, and of the `public` functions with it.
+    """Compile a `handler`, `XLA_FFI_Error* (XLA_FFI_CallFrame*)`, and `public` functions; their addresses.
 
-    They hold as long as the process. `write(module)` gives what the handler does, `work(code, plan, data, dims)`: with
-    the address that is the attribute, with those of the arguments and results, and with those of their sizes.
+    They are valid for the life of the process. `write(module)` returns `work(code, plan, data, dims)`, which emits the
+    body from the addresses of the attribute, of the arguments and results, and of their dimensions.
     """
     module = ir.Module(name)
     module.triple = ""
@@ -171,7 +171,7 @@ _engines = []  # of what XLA has registered
 
 
 def _tell_version(code: Code, extension: Value) -> None:
-    """XLA asks once, when the handler is registered, for which version of the interface it was written."""
+    """Emit the answer to XLA's query, at registration, for the version of the interface."""
     metadata, short = load_at(extension, _METADATA, POINTER), ir.IntType(32)
     for offset, number in ((_MAJOR, MAJOR), (_MINOR, MINOR), (_TRAITS, 0)):
         code.builder.store(ir.Constant(short, number), _function_address(metadata, offset).it)
@@ -196,8 +196,8 @@ def element(array: Value, index: int) -> Value:
 class PlanCode:
     """A function `(plan, *arrays, members, times, rows of ts, rows of params)` under construction.
 
-    `known` has all of these, what the plan says, and the strides from member to member, by the names that the fields of
-    a job have. The first three arrays are `ts`, `y0` and `params`.
+    `known` has all of these, the fields of the plan, and the strides between members, under the names of the fields of
+    a job. The first three arrays are `ts`, `y0` and `params`.
     """
 
     def __init__(self, module: ir.Module, name: str, plan: type, arrays: tuple[str, ...]):
@@ -213,9 +213,9 @@ class PlanCode:
         self.known["params_stride"] = code.select(rows_of_params > 1, self.known["numbers"], 0)
 
     def run(self, kernel: str, job: type, fields: dict[str, Any], *memory: Value, rounds: Value) -> Value:
-        """Begin and run a kernel, by its name in the plan, on the memory and the integers of a thread.
+        """Emit calls of `begin` and `run` of a kernel of the plan, on the memory and the integers of a thread.
 
-        The `fields` of the job stand before what is `known`. Returns 1 if there is more to do.
+        Job fields come from `fields`, else from `known`. Returns 1 if there is more to do.
         """
         code = self.code
         given = job_of(code, job, self.known | fields)
@@ -223,13 +223,13 @@ class PlanCode:
         return call(code, self.known[f"run{kernel}"], INTEGER, given, *memory, rounds)
 
     def skipped(self, address: Value) -> Value:
-        """The doubles from an address to the next boundary of a cache line."""
+        """The number of doubles from an address to the next cache line."""
         place = Value(self.code, self.code.builder.ptrtoint(address.it, INTEGER))
         mask = ir.Constant(INTEGER, 8 * CACHE_LINE - 1)
         return Value(self.code, self.code.builder.and_((0 - place).it, mask)) / 8
 
     def finish(self) -> Callable:
-        """The `work` of a handler: a call of this function."""
+        """Complete the function; return a `work` function of `compile_handler` that calls it."""
         function = self.code.finish()
 
         def work(code: Code, plan: Value, data: list[Value], dims: list[Value]) -> None:
@@ -241,7 +241,7 @@ class PlanCode:
 
 
 def _write_begin_run(module: ir.Module) -> Callable:
-    """`begin_run(plan, *arguments, *results, members, times, rows of ts, rows of params)`."""
+    """Emit `begin_run(plan, *arguments, *results, members, times, rows of ts, rows of params)`."""
     run = PlanCode(module, "begin_run", Plan, (*ARGUMENTS, *RESULTS))
     code, known = run.code, run.known
     code.fill(known["path"], known["members"] * known["times"] * known["states"], float("nan"))
@@ -258,7 +258,7 @@ def _write_begin_run(module: ir.Module) -> Callable:
 
 
 def job_of(code: Code, kind: type, fields: dict[str, Any]) -> Value:
-    """A job on the stack, a structure of this kind: of `fields` those that it declares, others zero."""
+    """A job structure of this kind on the stack, with the given `fields`; other fields are zero."""
     declared: Any = kind
     job = code.stack(len(declared._fields_))
     for i, (name, of_field) in enumerate(declared._fields_):

@@ -1,8 +1,8 @@
-"""The integration of a batch by Taylor series, as two functions of LLVM: one begins, one runs this many rounds.
+"""The integration of a batch by Taylor series, as two LLVM functions: `begin`, and `run` for a number of rounds.
 
-Every lane of a vector carries one member. A round takes one step in each lane:
+Every lane of a vector has one member. A round takes one step in each lane:
 
-    coefficients   q and q̇ as power series about the present time (`_taylor`)
+    coefficients   q and q̇ as power series about the current time (`_taylor`)
     choose         the step that the last two coefficients allow, per lane (`_step`); it ends at the first border of a
                    piecewise program (`_border_control`)
     check          the series must satisfy the equations of motion along the step, and end near its constraints
@@ -12,7 +12,7 @@ Every lane of a vector carries one member. A round takes one step in each lane:
                    carried along
     finish         a lane whose member has ended takes the next one of the batch
 
-so that no lane waits for another. Several threads may do so at once: they share the counter that hands out the members.
+so that no lane waits for another. Several threads may run at once: they share the counter of members.
 """
 
 from lagjax._native.code._constants import (
@@ -49,7 +49,7 @@ JOB = job(
 
 
 class Integrator:
-    """Builds the module, whose public functions are `begin` and `run`; `error_groups` as in `StepControl`."""
+    """The module of an integrator, with public functions `begin` and `run`; `error_groups` as in `StepControl`."""
 
     job = JOB
 
@@ -87,7 +87,7 @@ class Integrator:
     # ---- members ----
 
     def _start_next(self) -> Code:
-        """`(lane)`: the lane takes the next member, or none is left."""
+        """Emit `(lane)`: load the next member into a lane, which becomes idle if none is left."""
         frame = self.motion.function("start_next", INTEGER)
         code, lane = frame.code, frame.lane(frame.arguments[0])
         member = frame.next("next_member")
@@ -104,7 +104,7 @@ class Integrator:
         return frame.finish()
 
     def _load_member(self, frame: Frame, lane: Lane, member: Value) -> None:
-        """Times, initial state and parameters of the member that a lane has taken."""
+        """Set the times, initial state and parameters of the member in a lane."""
         code, motion = frame.code, self.motion
         begin, end = (frame.time(member, i) for i in (0, frame.job("times") - 1))
         lane["t"], lane["t_end"] = begin, end
@@ -130,7 +130,7 @@ class Integrator:
     # ---- rounds ----
 
     def _run_function(self) -> None:
-        """`run(job, memory, lanes, idle, rounds)`: 1 if there is more to do after these. `idle` counts idle lanes."""
+        """Emit `run(job, memory, lanes, idle, rounds)`: 1 if more is to do after these; `idle` counts idle steps."""
         frame = self.motion.function("run", POINTER, INTEGER, result=INTEGER, public=True)
         code, (idle, rounds) = frame.code, frame.arguments
         order, borders = frame.job("order"), self.borders
@@ -169,7 +169,7 @@ class Integrator:
         frame.finish(self.motion.is_unfinished(frame))
 
     def _finish_members(self, frame: Frame, idle) -> None:
-        """Write down the members that have ended, and take the next ones."""
+        """Write the results of members that have ended, and load the next ones."""
         code = frame.code
         ending, steps, rejected = (frame[name] for name in ("code", "steps", "rejected"))
         limit = code.as_double(frame.job("max_steps"))

@@ -1,4 +1,4 @@
-"""The machine code of a motion as a function of arrays, and its transposed derivative as another."""
+"""The machine code of a motion, and of its derivatives, as functions of NumPy arrays."""
 
 import ctypes
 import functools
@@ -37,9 +37,9 @@ _RERUNS_PER_SLICE, _LEAST_ROUNDS = 30, 16
 class Outcome(NamedTuple):
     """The results of a run of N members, T output times and 2n states.
 
-    A row of `table` (rows, 2n + 4) is a step that was written down, member by member: its time, its size, the number of
-    the member, that of the step, its first state. For a piecewise program the pieces follow, and the number of the
-    border that the step ends at.
+    A row of `table` (rows, 2n + 4) is a recorded step, sorted by member: its time, its size, the number of the member,
+    that of the step, its first state. For a piecewise program the pieces follow, and the number of the border at its
+    end.
     """
 
     path: np.ndarray  # (N, T, 2n), the states (q, q̇) at the output times, NaN where a member did not come
@@ -55,9 +55,10 @@ class Outcome(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """The steps of N members, by series of this `order`: `counts[k]` rows of `table` from `first[k]` on of member k.
+    """The recorded steps of N members, with series of this `order`: rows `first[k]` on, `counts[k]` of them.
 
-    The table is that of an `Outcome`. Where it is one of several runs, member k was number `rows[k]` of its `kernel`'s.
+    The rows are those of `table`, that of an `Outcome`. If it is one of several runs, member k was number `rows[k]` of
+    the run of `kernel`.
     """
 
     table: np.ndarray
@@ -71,13 +72,13 @@ class Steps(NamedTuple):
         return self._replace(first=self.first[places], counts=self.counts[places], rows=self.rows[places])
 
     def split_members(self) -> Iterator[tuple[int, np.ndarray]]:
-        """The row of each member, and those of the table that are its steps."""
+        """The row of each member, and the part of the table with its steps."""
         for row, first, count in zip(self.rows.tolist(), self.first, self.counts, strict=True):
             yield row, self.table[first : first + count]
 
 
 class Begun(NamedTuple):
-    """The results of a run as a handler left it (`_handler.Handler`), some not yet written; arrays of NumPy or JAX."""
+    """The results of a run as a handler left it (`_handler.Handler`), perhaps incomplete; arrays of NumPy or JAX."""
 
     path: Any
     y_end: Any
@@ -90,15 +91,15 @@ class Begun(NamedTuple):
 
 
 class Kernel:
-    """The integration of (q, q̇) with q̈ from a program, whose inputs are q, q̇, t and numbers that stay constant.
+    """The integration of (q, q̇), with q̈ from a program of q, q̇, t and constant parameters, for batches.
 
     The outputs of the program are the n accelerations, then whether the mass matrix is singular. `projection` is
-    applied to the state after every step, and to the outputs after the first. `guards`, again from the same inputs, end
-    the motion of a member with the code `EVENT`; or they are noted and the motion continues: then notes take the
-    place of states at output times. Errors are relative to each coordinate, or to the largest one of those with the
-    same number in `error_groups` (n,). The coordinates may be those of a motion with its tangents (`nesting`); then
-    `motion` is the program of the motion alone. Vectors have `width` lanes, by default those of the processor. Raises
-    `Unlowerable` where an operation has no Taylor series or is not one of doubles.
+    applied to the state after every step, and to the outputs after the first. `guards`, of the same inputs, end the
+    motion of a member with the code `EVENT`; or their changes are noted while the motion continues: then notes replace
+    states at output times. Errors are relative to each coordinate, or to the largest one of those with the same number
+    in `error_groups` (n,). The coordinates may be those of a motion with its tangents (`nesting`); then `motion` is the
+    program of the motion alone. Vectors have `width` lanes, by default those of the processor. Raises `Unlowerable`
+    where an operation has no Taylor series or is not one of doubles.
     """
 
     def __init__(
@@ -129,7 +130,7 @@ class Kernel:
         self._rounds = max(1, int(SLICE / (_SECONDS_AN_OPERATION * len(program.line.nodes))))
 
     def select_width(self, members: int) -> "Kernel":
-        """The kernel for `members` members: that for a single one has no lanes, which would be idle."""
+        """The kernel for this many members: for a single one that with one lane, since further lanes would be idle."""
         return self._single_member_kernel if members == 1 < self.width else self
 
     @functools.cached_property
@@ -142,7 +143,7 @@ class Kernel:
 
     @property
     def chosen(self) -> Chosen | None:
-        """The numbers of a member that its programs compute with; None where these are all."""
+        """The parameters of a member that the programs compute with; None for all."""
         return self._parts.chosen
 
     def _integrator(self) -> Integrator:
@@ -171,19 +172,20 @@ class Kernel:
 
     @property
     def rest_size(self) -> int:
-        """The doubles of the `rest` that a handler leaves behind."""
+        """The size, in doubles, of the `rest` of an unfinished run."""
         return Rest.size(self._forward.layout)
 
     def __call__(
         self, ts, y0, params, rtol, atol, max_steps, room=0, begun: Begun | None = None, room_of_notes=0, order=0
     ) -> Outcome:
-        """The motions from the states `y0` (N, 2n), all arrays of float64.
+        """Integrate from the states `y0` (N, 2n); all arrays are float64.
 
-        `ts` (N, T) are the output times and `params` (N, P) the constant numbers; or one row for all. As many
-        steps as there is `room` for are written down, for derivatives. What a handler has `begun` is continued. The
-        series are of this `order`; by default of that which suits rtol.
-        Where guards are noted, with this much room for each, `path` holds the notes for one guard after the other: a
-        time, and the state then, (N, guards (room + 1), 1 + 2n); behind them how many there would have been.
+        `ts` (N, T) are the output times and `params` (N, P) the parameters; or one row for all. Up to `room` steps are
+        recorded, for derivatives. `begun` is a run to be resumed. The series have this `order`; by default the one for
+        rtol.
+
+        If guards are noted, with `room_of_notes` each, `path` holds the notes, one guard after the other: a time, and
+        the state then, (N, guards (room + 1), 1 + 2n); in the last row of a guard the number of all its changes.
         """
         ts, y0, params = _contiguous_doubles(ts, y0, params)
         members, times = len(y0), ts.shape[1]
@@ -221,7 +223,7 @@ class Kernel:
         return _collect_results(path, y_end, t_end, code, steps, rejected, changes, idle, table)
 
     def _begin_run(self, ts, y0, params, plan: Plan) -> Begun:
-        """Run few members for a slice of time, by one call of machine code."""
+        """Run few members for one time slice, in one call of machine code."""
         members, times, states = len(y0), ts.shape[1], self.states
         guards = self.ending_guards
         block, ends = np.empty(members * (times * states + states + 4 + guards) + self.rest_size), [0]
@@ -235,11 +237,11 @@ class Kernel:
         return Begun._make([*shaped, *others, changes.reshape(members, guards), rest])
 
     def vjp(self, ts, params, record: Steps, path_ct, y_ct) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The transposed derivative of a run, over the steps it wrote down.
+        """The vector–Jacobian product of a run, over its recorded steps.
 
-        From the cotangents of the outputs, `path_ct` (N, T, 2n), of which the first and the last are not looked at, and
-        of the states at the end, `y_ct` (N, 2n), to those of the initial states (N, 2n) and of the parameters (N, P).
-        The last array (N,) estimates how large the last terms of the series of a tangent may have been, relative to it.
+        It maps cotangents of the outputs, `path_ct` (N, T, 2n), the first and last of which are not read, and of the
+        final states, `y_ct` (N, 2n), to those of the initial states (N, 2n) and of the parameters (N, P). The last
+        array (N,) estimates the last terms of the series of a tangent relative to it, an upper bound.
         """
         y_ct = np.array(y_ct, np.float64, order="C")
         results = y_ct, np.zeros((len(y_ct), self.numbers)), np.zeros(len(y_ct))
@@ -248,7 +250,7 @@ class Kernel:
         return results
 
     def _transpose_kernel(self, members: int) -> "tuple[_CompiledRun, int]":
-        """The transpose for this many members, and on how many threads."""
+        """The adjoint for this many members, and its number of threads."""
         kernel = self.select_width(1 if members < self.width / 2 else members)  # few are as fast one after the other
         # A vector of members is as much work as the motions of several, and worth a thread the sooner.
         return kernel._backward, min(kernel.threads(members * MOTIONS_PER_ADJOINT), -(-members // kernel.width))
@@ -256,12 +258,12 @@ class Kernel:
     def jvp(
         self, ts, params, record: Steps, y_dot, params_dot, floor: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The derivative of a run along m directions, over the steps it wrote down.
+        """The Jacobian–vector products of a run along m directions, over its recorded steps.
 
-        From the tangents of the initial states, `y_dot` (N, m, 2n), and of the parameters, `params_dot` (N, m, P), to
-        those of the outputs, an array (N, m, T, 2n) of which the last is not written, and of the states at the end
-        (N, m, 2n). The last array (N,) says how large the last two terms of the series of a tangent became, at most,
-        relative to the tangent or to the `floor`.
+        It maps tangents of the initial states, `y_dot` (N, m, 2n), and of the parameters, `params_dot` (N, m, P), to
+        those of the outputs, (N, m, T, 2n), the last of which is not written, and of the final states (N, m, 2n). The
+        last array (N,) is the largest value of the last two terms of the series of a tangent, relative to the tangent
+        or to the `floor`.
         """
         y_dot = np.array(y_dot, np.float64, order="C")
         members, directions = y_dot.shape[:2]
@@ -275,7 +277,7 @@ class Kernel:
     def _run_derivative(
         self, kernel: "tuple[_CompiledRun, int]", ts, params, record: Steps, arrays: dict, **numbers: float
     ) -> None:
-        """Run a kernel of derivatives, with its number of threads, over the steps of a record; `arrays` are its own."""
+        """Run a derivative kernel, given with its number of threads, over recorded steps; `arrays` are its own."""
         names = ("ts", "params", "record", *arrays)
         arrays = dict(zip(names, _contiguous_doubles(ts, params, record.table, *arrays.values()), strict=True))
         ts, params = arrays["ts"], arrays["params"]
@@ -286,7 +288,7 @@ class Kernel:
         compiled(arrays, numbers, threads)
 
     def _tangent_kernel(self, members: int, directions: int) -> "tuple[_CompiledRun, int]":
-        """The tangents of this many members along this many directions, and on how many threads."""
+        """The tangent kernel for these numbers of members and directions, and its number of threads."""
         if directions > 1 and members < self.width / 2:
             return self._tangents(True), min(cores(), members)
         kernel = self.select_width(members)
@@ -294,20 +296,20 @@ class Kernel:
         return kernel._tangents(False), min(kernel.threads(members * directions), -(-members // kernel.width))
 
     def _compile_tangents(self, side_by_side: bool) -> "_CompiledRun":
-        """The kernel of tangents: directions of one member in its lanes, or members; compiled on first use."""
+        """The tangent kernel: lanes hold directions of one member (`side_by_side`) or members."""
         width = 1 if side_by_side else self.width
         return _CompiledRun(Tangent(self._derivative_parts, width=width, lanes=self.width), self._rounds)
 
     def plan(self, rtol: float, atol: float, max_steps: int) -> Plan:
-        """The plan by which a handler begins a run; it lives as long as this kernel."""
+        """The plan with which a handler starts a run; valid as long as this kernel."""
         begin, run = self._forward.places
         size, rounds = self._forward.layout.size, self._forward.rounds
         return Plan(begin, run, size, self.states, self.numbers, order_for(rtol), max_steps, rounds, rtol, atol)
 
     @property
     def rounds_of_rerun(self) -> int:
-        """Rounds of a motion that a handler runs again for a derivative; 0 of a long or a piecewise one."""
-        if self.borders is not None and (self.borders.switches or self.borders.abrupt):
+        """The rounds of a motion that a handler recomputes for a derivative; 0 for a long or a piecewise one."""
+        if self.borders is not None and (self.borders.switches or self.borders.root_arguments):
             return 0
         rounds = self._rounds // _RERUNS_PER_SLICE
         return rounds if rounds >= _LEAST_ROUNDS else 0
@@ -315,7 +317,7 @@ class Kernel:
     def derivative_plan(
         self, kind: str, members: int, times: int, directions: int, rtol: float, atol: float, max_steps: int
     ) -> DerivativePlan:
-        """The plan of derivatives of this many members; it lives as long as this kernel."""
+        """The plan of derivatives of this many members; valid as long as this kernel."""
         motion = self.select_width(members)._forward
         derivative, _ = self._tangent_kernel(members, directions) if kind == "jvp" else self._transpose_kernel(members)
         rounds, others = self.rounds_of_rerun, self.numbers if kind == "vjp" else directions * times * self.states
@@ -328,7 +330,7 @@ class Kernel:
 
     @property
     def _derivative_parts(self) -> MotionParts:
-        """The parts of derivatives over steps that have been taken: features do not matter to these."""
+        """The parts for derivatives over recorded steps, which need no features and no guards."""
         if not self._parts.pieces:
             return self._smooth
         return self._parts if self._guards is None else self._parts.drop_guards
@@ -345,9 +347,9 @@ class Kernel:
 
 
 class _CompiledRun:
-    """The functions `begin` and `run` of a module: all members of a job, on several threads.
+    """The compiled functions `begin` and `run` of a module, called for all members of a job on several threads.
 
-    `rounds` is how many of them a slice has at first, `more` the numbers that are recorded behind the state of a step.
+    `rounds` is the number of rounds in the first time slice, `more` that of numbers recorded after the state of a step.
     """
 
     def __init__(self, built: Integrator | Tangent | Adjoint, rounds: int):
@@ -369,7 +371,7 @@ class _CompiledRun:
     def __call__(
         self, arrays: Mapping[str, np.ndarray | None], numbers: Mapping[str, float], threads: int, rest=None
     ) -> int:
-        """Work on the arrays, from the beginning or on the `rest` of a run; returns the number of idle steps."""
+        """Run a job on these arrays, from the start or from the `rest` of a run; returns the number of idle steps."""
         addresses = {name: None if array is None else array.ctypes.data for name, array in arrays.items()}
         job = self._job(**addresses, **numbers)
 
@@ -391,7 +393,7 @@ class _CompiledRun:
 
 
 def _collect_results(path, y_end, t_end, code, steps, rejected, changes, idle: int, table=None) -> Outcome:
-    """The results in the arrays of a finished run; NaN in the path where a member did not come."""
+    """The outcome of a finished run; NaN in the path at times that a member did not reach."""
     ended_badly = code != DONE
     if ended_badly.any() and path.shape[2] == y_end.shape[1]:  # a start that is infinite was not reached either
         reached = np.isfinite(path[ended_badly]).all(axis=2, keepdims=True)
@@ -402,9 +404,9 @@ def _collect_results(path, y_end, t_end, code, steps, rejected, changes, idle: i
 
 
 def _sort_by_member(table: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rows of members with all their `steps` (N,), sorted by member, and the indices of these members.
+    """The rows of members with all their `steps` (N,) recorded, sorted by member, and a flag (N,) for these.
 
-    A step that was undone was written down more than once: the last time counts.
+    A step that was undone was recorded more than once: the last record counts.
     """
     member, step = table[:, 2].astype(np.int64), table[:, 3].astype(np.int64)
     lasting = np.flatnonzero(step < steps[member])
@@ -424,7 +426,7 @@ def _contiguous_doubles(*arrays) -> list[np.ndarray]:
 
 
 def floor_of(rtol: float, atol: float) -> float:
-    """atol / rtol; by default (an atol of 0) what it is where nothing is small."""
+    """The size below which a number counts as small: atol / rtol, or the default ratio if atol is 0."""
     return atol / rtol if atol > 0 else ATOL_OVER_RTOL
 
 

@@ -1,7 +1,7 @@
-"""Straight lines as calls of XLA: rows of inputs to rows of outputs, without Python and without a compiler of XLA's.
+"""Straight lines as calls of XLA: rows of inputs to rows of outputs, without Python and without XLA's compiler.
 
-One handler serves all lines: the attribute of a call is where the machine code of its line is. What many rows share,
-as the directions of a Jacobian share their state, is computed once:
+One handler serves all lines: the attribute of a call is the address of the line's machine code. What many rows share,
+such as the state in all directions of a Jacobian, is computed once:
 
     inputs of all rows ─► what depends on these alone, once ─► the rest, several rows side by side
 """
@@ -25,15 +25,16 @@ _SET_ROWS = "set_rows"
 
 
 class LineCode:
-    """A straight line of `inputs` floats in machine code, for as long as this object lives.
+    """The machine code of a straight line with `inputs` floats; it is freed with this object.
 
     At its `address` is `evaluate(x, out, rows, given, times)`, `times` times with x (rows, inputs) and out (rows,
-    outputs). Inputs that are `shared` are the same in all `rows` and stand in given (times, shared), x has the others.
-    A line of more than `largest` operations is a walk along rows of integers, for which LLVM takes no longer, and
-    shares none. Where its first inputs, so many, are `moving`, that gives the running errors of the outputs in their
-    place (`_program._rounding`): a line of them would be five times as long. What is written out may take several rows
-    at once, in `lanes`. Every operation rounds, so that all of these forms have the same digits on every processor,
-    and in C (`_c_lines`). Raises `Unlowerable`.
+    outputs). Inputs in `shared` are equal in all `rows` and passed as given (times, shared); x has the others.
+
+    A line of more than `largest` operations is interpreted from an array of integers, for which LLVM takes no longer,
+    and has no shared inputs. With `moving`, a number of first inputs, it computes the running errors of the outputs
+    instead of the outputs (`_program._rounding`): a compiled line of them would be five times as long. A compiled line
+    may process several rows at once, in `lanes`. Every operation rounds, so that all of these forms have the same
+    digits on every processor, and in C (`_c_lines`). Raises `Unlowerable`.
     """
 
     def __init__(
@@ -84,7 +85,7 @@ class LineCode:
         self._evaluate = line_function(self.address)
 
     def __call__(self, rows: np.ndarray, given: np.ndarray | None = None) -> np.ndarray:
-        """The outputs (R, outputs) at rows (R, inputs) without those that are shared, which are `given`."""
+        """The outputs (R, outputs) at rows (R, inputs) without the shared inputs, which are `given`."""
         rows, found = np.ascontiguousarray(rows, float), np.empty((len(rows), self._outputs))
         given = np.ascontiguousarray([] if given is None else given, float)
         self._evaluate(rows.ctypes.data, found.ctypes.data, len(rows), given.ctypes.data, 1)
@@ -106,10 +107,10 @@ WORK_OPTIMISED = 12_000
 
 
 def compilation_work(line: StraightLine, lanes: int) -> int:
-    """The additions for which LLVM takes as long as for this line, if it is written out.
+    """The length of a chain of additions that takes LLVM as long to compile as this line.
 
-    Measured: decisions and functions take as long as 4, and functions that the C library evaluates, lane by lane, as
-    40 in eight lanes.
+    Measured: decisions and functions take as long as 4, and functions that the C library evaluates, lane by lane, as 40
+    in eight lanes.
     """
     slow = 5 * lanes if lanes > 1 else 4
     weights = (
@@ -121,9 +122,9 @@ def compilation_work(line: StraightLine, lanes: int) -> int:
 def _split_line(
     line: StraightLine, inputs: int, filled: list[int], shared: tuple[int, ...]
 ) -> tuple[StraightLine | None, StraightLine]:
-    """The line of what depends on inputs that are shared alone, and the rest of those that are not, then its outputs.
+    """The line of all that depends on shared inputs alone, and the line from its outputs and the other inputs.
 
-    Each has the inputs of its own from 0 on, in order. None where nothing is computed of shared inputs.
+    Inputs of each are renumbered from 0, in order. None for the first if nothing is computed from shared inputs alone.
     """
     own = {i: k for k, i in enumerate(i for i in range(inputs) if i not in set(shared))}
     if not shared:
@@ -156,7 +157,7 @@ def _sincos_of(module: ir.Module, line: StraightLine, lanes: int, name: str) -> 
 
 
 def _write_shared_part(module: ir.Module, line: StraightLine, inputs: int) -> Code:
-    """The function (inputs, outputs) of a line."""
+    """Emit a function (inputs, outputs) for a line."""
     code, sincos = Code(module, "common", [POINTER, POINTER], 1, rounds=True), _sincos_of(module, line, 1, "common")
     given, out = code.arguments
     if compilation_work(line, 1) > WORK_OPTIMISED:
@@ -169,9 +170,9 @@ def _write_shared_part(module: ir.Module, line: StraightLine, inputs: int) -> Co
 def _write_line_outputs(
     code: Code, sincos: Code | None, line: StraightLine, own: int, filled: list[int], x: Value, out: Value, room: Value
 ) -> None:
-    """Write the outputs that are `filled` of a line, operation by operation; a number of x and `out` has all lanes.
+    """Emit the computation of the outputs `filled` of a line; each number of x and `out` has one value per lane.
 
-    Inputs beyond the `own` ones stand in a `room`, one number for all lanes.
+    Inputs after the first `own` ones are read from `room`, one number for all lanes.
     """
     lanes = code.lanes
 
@@ -190,7 +191,7 @@ def _write_line_outputs(
 def _write_tiles(
     code: Code, sincos: Code | None, line: StraightLine, inputs: int, filled: list[int], arrays: tuple[Value, ...]
 ) -> None:
-    """Write a line for tiles of rows, one in a lane; those beyond the last are that once more."""
+    """Emit a loop over tiles of rows, one row per lane; the last tile repeats the last row."""
     (x, out, rows, room), lanes, outputs = arrays, code.lanes, len(line.outputs)
     given, found = code.stack(inputs * lanes, 64), code.stack(outputs * lanes, 64)
     with code.loop(outputs * lanes) as k:
@@ -213,11 +214,11 @@ def _write_tiles(
 
 
 class _RowWalk:
-    """A line as `numbers`: how many rows, constants and outputs, then these.
+    """A straight line as an array `numbers` of integers that a loop interprets: three counts, then the rows.
 
-    A row is the case of an operation, its operands and its result, places in a room of `size` doubles, where constants
-    and inputs stand first. Where nobody needs a number any more another one stands; an output is its place and there.
-    Errors, where the first inputs are `moving`, stand behind the room, in the same order.
+    A row is the case of an operation, and the slots of its operands and its result in `size` doubles of memory, where
+    constants and inputs come first. A slot is reused after its last use; the slots of outputs follow the rows. Errors,
+    if the first inputs are `moving`, are in a second memory of the same layout.
     """
 
     def __init__(self, line: StraightLine, inputs: int, filled: list[int], moving: int | None):
@@ -252,7 +253,7 @@ class _RowWalk:
         self.numbers = np.concatenate([np.array(x, np.int64).ravel() for x in (counts, rows, values, found)])
 
     def __call__(self, code: Code, sincos: Code | None, x: Value, out: Value, room: Value) -> None:
-        """Write the walk."""
+        """Emit the interpreter loop."""
         module = code.module
         place: Any = ir.GlobalVariable(module, POINTER, "rows")
         place.linkage, place.initializer = "internal", ir.Constant(POINTER, None)
@@ -288,7 +289,7 @@ class _RowWalk:
             code.store(code.load(code.element(rooms[-1], at), DOUBLE), code.element(out, k))
 
     def _write_case(self, op: str, attribute, kinds: tuple[str, ...]) -> StraightLine:
-        """An operation of operands of some kinds, the last of which is its own; behind these are their errors."""
+        """The line of one operation of operands of `kinds` (the last one is its own), or of it and its error."""
         *of_operands, kind = kinds
         graph = Graph(1000)
         operands = [graph.input(i, of) for i, of in enumerate(of_operands)]
@@ -305,8 +306,10 @@ class _RowWalk:
 
 @make_once
 def line_handler() -> int:
-    """The address of the handler of all lines: from x (times, rows, inputs) and what is shared, (times, shared), to a
-    result (times, rows, outputs), all of doubles."""
+    """The address of the XLA handler of all lines.
+
+    It maps x (times, rows, inputs) and shared inputs (times, shared) to (times, rows, outputs), all doubles.
+    """
 
     def evaluate(code: Code, line: Value, data: list[Value], dims: list[Value]) -> None:
         address = Value(code, code.builder.ptrtoint(line.it, INTEGER))

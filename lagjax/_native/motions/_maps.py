@@ -1,4 +1,4 @@
-"""The maps that a step is made of, each with its two derivatives.
+"""The maps that a step is composed of, each with its pushforward and its pullback.
 
 A step y(t + h) = Σ yₖ hᵏ is a composition of maps of the state y₀ and the parameters p:
 
@@ -10,10 +10,9 @@ A step y(t + h) = Σ yₖ hᵏ is a composition of maps of the state y₀ and th
     ProjectedEnd      the end of the series ↦ that on the constraints
     Saltation         a state at a border ↦ that on the piece beyond it (`_saltation`)
 
-`TaylorSeries.coefficients` computes three more. Here `push` emits the pushforward of a map, from the tangents of
-its arguments to those of its results, and `pull` its pullback, which takes cotangents of results and adds to those of
-arguments. What reads a step in one of the two ways (`_tangent`, `_adjoint`) is a loop over the maps; a new kind of map
-brings its two rules, and nothing else knows of it.
+The maps themselves are computed by `TaylorSeries.coefficients`. Here `push` emits the pushforward of a map, from
+tangents of its arguments to those of its results, and `pull` its pullback, which takes cotangents of results and adds
+to those of arguments. `_tangent` and `_adjoint` are loops over the maps; a new kind of map needs these two rules only.
 
 Source: Griewank & Walther, *Evaluating Derivatives* (2008), §§3.2, 13.
 """
@@ -30,7 +29,7 @@ from lagjax._program import pullback, pullback_and_entries, pushforward
 
 
 class ZerothOrder:
-    """The acceleration, and what the order recursion reads of it, as functions of the state and the parameters."""
+    """The map from state and parameters to the acceleration and the values that the order recursion reads."""
 
     def __init__(self, motion: TaylorSeries, parts: MotionParts):
         n, values = motion.n, motion.series.values
@@ -38,7 +37,7 @@ class ZerothOrder:
         self.outputs = [*range(n), *range(n + 1, n + 1 + values)]
 
     def push(self, directions: Directions, frame: Frame) -> None:
-        """To the coefficients of order 1, and the values."""
+        """Emit the tangents of the coefficients of order 1, and of the values."""
         motion, n, states = self.motion, self.motion.n, self.motion.states
         line = pushforward(motion.series.zeroth_order, self.dtypes, directions.varied, self.outputs, self.outputs)
         state = directions.numbers_of(frame, "y", states, lambda i: (i, 0), in_place=True)
@@ -53,7 +52,7 @@ class ZerothOrder:
             frame["dy", i + n, 1] = out[i]
 
     def pull(self, cotangents: Cotangents) -> Code:
-        """`()`: from the coefficients of order 1 and the values to the state and the parameters."""
+        """Emit `()`: from cotangents of order 1 and of the values to those of the state and the parameters."""
         motion, n = self.motion, self.motion.n
         line, tables = pullback_and_entries(motion.series.zeroth_order, self.dtypes, cotangents.varied, self.outputs)
         frame, form = motion.function("back_start"), motion.form
@@ -68,14 +67,14 @@ class ZerothOrder:
 
 
 class CauchyProducts:
-    """The sums Σ' aⱼ bₖ₋ⱼ of every product, 0 < j < k."""
+    """The map from rows to the sums Σ' aⱼ bₖ₋ⱼ, 0 < j < k, of every product."""
 
     def __init__(self, motion: TaylorSeries):
         self.motion, pairs = motion, motion.series.cauchy_products
         self.mixed, self.squares = ([p for p in pairs if (p[0] == p[1]) == square] for square in (False, True))
 
     def push(self, directions: Directions) -> Code:
-        """`(k)`: Σ' (δaⱼ bₖ₋ⱼ + aⱼ δbₖ₋ⱼ) for every product."""
+        """Emit `(k)`: the tangents Σ' (δaⱼ bₖ₋ⱼ + aⱼ δbₖ₋ⱼ) of every product."""
         frame = directions.function("cauchy_products", INTEGER)
         code, (k,) = frame.code, frame.arguments
         kinds = [(some, self.motion.table(some, 1)) for some in (self.mixed, self.squares)]
@@ -91,7 +90,7 @@ class CauchyProducts:
     def _push_product(
         self, directions: Directions, frame: Frame, table: Value, i: Value, order: int, square: bool
     ) -> Value:
-        """Of one product; of a square, twice the first half of it."""
+        """The tangent of product i at a constant order; of a square, twice the first half of its sum."""
         code, width, lanes = frame.code, self.motion.width, directions.lanes
         motion, shared = frame.view(self.motion.layout), width < lanes
 
@@ -117,7 +116,7 @@ class CauchyProducts:
         return total + total if square else total
 
     def pull(self) -> Code:
-        """`(k, order)`: from the sums of higher orders to the rows of order k."""
+        """Emit `(k, order)`: from cotangents of the sums of higher orders to those of the rows of order k."""
         motion = self.motion
         frame = motion.function("back_sums", INTEGER, INTEGER)
         code, (k, order) = frame.code, frame.arguments
@@ -133,7 +132,7 @@ class CauchyProducts:
         return frame.finish()
 
     def _pull_product(self, frame: Frame, table, i: Value, first: int, k: Value, terms: int) -> None:
-        """s = Σ' aⱼ bₖ₋ⱼ at orders k + 1, …: its cotangent times b is one of a, and times a one of b."""
+        """Emit, for s = Σ' aⱼ bₖ₋ⱼ at orders k + 1, …: the cotangent of s times b is added to a's, times a to b's."""
         code, width, products = frame.code, self.motion.width, len(self.motion.series.cauchy_products)
         # The cotangents of higher orders lie where the sums themselves were.
         cotangents = frame.address("sums", k, i + first)
@@ -151,7 +150,7 @@ class CauchyProducts:
 
 
 class OrderRecursion:
-    """The rows of order k and the state of order k + 1, from the state of order k and the sums."""
+    """The map from the state of order k and the sums to the rows of order k and the state of order k + 1."""
 
     def __init__(self, motion: TaylorSeries, parts: MotionParts):
         series, n = motion.series, motion.n
@@ -161,7 +160,7 @@ class OrderRecursion:
         self.outputs = range(n + series.rows)
 
     def push(self, directions: Directions) -> Code:
-        """`(k)`: to the rows of order k, and to the state of order k + 1."""
+        """Emit `(k)`: the tangents of the rows of order k, and of the state of order k + 1."""
         motion, series, form = self.motion, self.motion.series, directions.form
         line = pushforward(series.order_recursion, self.dtypes, self.varied, self.outputs, self.rows)
         frame = directions.function("recursion", INTEGER)
@@ -187,9 +186,9 @@ class OrderRecursion:
         return frame.finish()
 
     def pull(self) -> Code:
-        """`(k)`: from the state of order k + 1 and the rows of order k to the state of order k, values and sums.
+        """Emit `(k)`: from cotangents of state k + 1 and rows k to those of state k, values and sums.
 
-        Those of the sums take the place of the sums, which are not read again: all of it fits into the first cache.
+        Those of the sums overwrite the sums, which are not read again: then all of it fits into the first cache.
         """
         motion = self.motion
         series, n, form = motion.series, motion.n, motion.form
@@ -212,13 +211,13 @@ class OrderRecursion:
 
 
 class SeriesSum:
-    """The state at a time within a step, Σ yₖ sᵏ. Where anything `kicks` the motion, outputs are at its begin, too."""
+    """The state at a time s within a step, Σ yₖ sᵏ. If anything `kicks` the motion, an output may be at its start."""
 
     def __init__(self, motion: TaylorSeries, kicks: bool = False):
         self.motion, self.kicks = motion, kicks
 
     def push(self, directions: Directions, frame: Frame, name: str, s: Value, powers: bool = False) -> None:
-        """Into a field; the last two powers stay in memory."""
+        """Emit the tangents of the sum into the field `name`; with `powers` the last two powers of s are stored."""
         code, power, order = frame.code, frame.code.variable(frame.constant(1.0)), frame.job("order")
         form, states = directions.form, directions.states
         for i in form.each(code, states):
@@ -233,7 +232,7 @@ class SeriesSum:
                 frame["power_before"], frame["power"] = before, now
 
     def pull(self) -> Code:
-        """`()`: from the end of the step and all outputs within it to all coefficients."""
+        """Emit `()`: from cotangents of the end of the step and of outputs within it to those of all coefficients."""
         motion = self.motion
         frame = motion.function("seed")
         code, h, power = frame.code, frame.code.lanes_of(frame["h"]), frame.code.variable(frame.constant(1.0))
@@ -250,7 +249,7 @@ class SeriesSum:
         return frame.finish()
 
     def _pull_outputs(self, frame: Frame, lane: Lane) -> None:
-        """The outputs of one lane that lie after the beginning of its step."""
+        """Emit the pullback of the outputs of one lane that lie after the start of its step."""
         motion = self.motion
         code, member, t, h = frame.code, lane["member"], lane["t"], lane["h"]
 
@@ -278,7 +277,7 @@ class SeriesSum:
 
 
 class ProjectedEnd:
-    """The state at the end of a step on the constraints, from the end of its series.
+    """The map from the end of the series to the state on the constraints.
 
     At a border that the motion crosses, derivatives are those of the series: the curvature of a constraint may jump
     there, and rounding would decide to which side the projection belongs.
@@ -289,14 +288,14 @@ class ProjectedEnd:
         self.motion, self.dtypes, self.line = motion, parts.program.dtypes, parts.projection.state.line
 
     def note_argument(self, frame: Frame) -> None:
-        """Note the end of the series, for its tangents, as `moved`."""
+        """Store the end of the series, for its tangents, as `moved`."""
         motion = self.motion
         moved = motion.move_state(frame, motion.increments(frame, frame.job("order"), frame["h"])[0])
         for i in motion.form.each(frame.code, motion.states):
             frame["moved", i] = moved[i]
 
     def push(self, directions: Directions) -> Code:
-        """`(group)`: from the end of the series, in `end`, to the end of the step there."""
+        """Emit `(group)`: from the tangents of the end of the series, in `end`, to those of the projected end."""
         states, form = directions.states, directions.form
         line = pushforward(self.line, self.dtypes, directions.varied, range(states))
         frame = directions.function("projected", INTEGER)
@@ -314,7 +313,7 @@ class ProjectedEnd:
         return frame.finish()
 
     def pull(self, cotangents: Cotangents) -> Code:
-        """`()`: from the end of the step to that of the series, and to the parameters."""
+        """Emit `()`: from cotangents of the projected end to those of the end of the series and the parameters."""
         motion = self.motion
         line, tables = pullback_and_entries(self.line, self.dtypes, cotangents.varied, range(motion.states))
         frame = motion.function("back_projection")

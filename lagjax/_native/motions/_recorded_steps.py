@@ -1,7 +1,7 @@
-"""The steps that the members of a batch have taken, once more: the loop of its derivatives, forward or back.
+"""The replay of recorded steps: the loop of the derivatives of a batch, forward or backward.
 
-Every lane carries one member. A round takes one step of the record (`_run_records`) in each lane: it makes the series
-of the motion again, and a derivative moves tangents or cotangents over the step. A lane whose member has no step left
+Every lane has one member. A round replays one step of the record (`_run_records`) in each lane: it computes the series
+of the motion again, and a derivative maps tangents or cotangents over the step. A lane whose member has no step left
 takes the next member that has any.
 """
 
@@ -19,10 +19,10 @@ from lagjax._native.steps._watch import GuardTable
 
 
 class StepReplay:
-    """The members and the recorded steps of a motion; a lane's `step` numbers the one that it is at.
+    """The replay of the recorded steps of a motion; `step` is the number of the current one in a lane.
 
-    `fields` are those of a derivative in a thread's memory, `at_borders` more of them where the motion has borders. The
-    kernel has the jump there `jumps` times.
+    `fields` are those of the derivative in a thread's memory, `at_borders` further ones if the motion has borders.
+    `jumps` is the number of copies of the border jump in the kernel, for the choice of its form.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class StepReplay:
         self.size = motion.states + RECORDED + motion.recorded_pieces  # of what is recorded of a step
 
     def saltation(self) -> Saltation | None:
-        """The map at the borders that steps end at; None without any."""
+        """The map of derivatives at the borders where steps end; None without any."""
         parts = self.parts
         if parts.borders is None or self._jump is None:
             return None
@@ -50,9 +50,9 @@ class StepReplay:
         return saltation
 
     def start_next(self, begin: Callable[[Frame, Value], None], take: Callable[[Frame, Lane, Value], None]) -> Code:
-        """`(lane)`: the lane takes the next member with steps, or none is left.
+        """Emit `(lane)`: load the next member with steps into the lane, which becomes idle if none is left.
 
-        `begin(frame, index)` sets the numbers of a lane, `take(frame, lane, member)` those of a member that is there.
+        `begin(frame, index)` sets the fields of a lane, `take(frame, lane, member)` those of a member that was found.
         """
         frame = self.motion.function("start_next", INTEGER)
         code, index = frame.code, frame.arguments[0]
@@ -75,7 +75,7 @@ class StepReplay:
 
     @contextmanager
     def rounds(self, frame: Frame, rounds: Value, leave: Callable[[Frame, Lane, Value], None]) -> Iterator[None]:
-        """A context: its body takes one step in every lane, whose series is there; then `leave(frame, lane, index)`."""
+        """A context: its body sees one step per lane with its series; then `leave(frame, lane, index)` is called."""
         code = frame.code
         with self.motion.rounds(frame, rounds):
             with code.loop(self.motion.width) as index:
@@ -90,11 +90,11 @@ class StepReplay:
                 leave(frame, frame.lane(index), index)
 
     def row(self, frame: Frame, lane: Lane) -> Value:
-        """The place in the record of the step that a lane is at."""
+        """The index in the record of the current step of a lane."""
         return (frame.read("first_step", lane["member"], INTEGER) + lane["step"]) * self.size
 
     def _recall_step(self, frame: Frame, lane: Lane) -> None:
-        """The time, size, first state and pieces of the step that the lane is at, and the border that it ends at."""
+        """Load the time, size, start state and pieces of the current step of a lane, and the border at its end."""
         motion, code = self.motion, frame.code
         with code.only_if(lane["member"] >= 0):
             row = self.row(frame, lane)

@@ -1,14 +1,14 @@
-"""The forward-mode derivative of a batch of motions: every step moved along directions, from the first to the last.
+"""The forward-mode derivative of a batch of motions: the pushforward of every step, from the first to the last.
 
-Along a direction (δy₀, δp) all numbers of a step have tangents, which follow in the order of the step itself, map by
-map (`_maps`): over a border, through the zeroth order, through every order, to the end and to every output within.
+Along a direction (δy₀, δp) all numbers of a step have tangents. They are computed in the order of the step itself, map
+by map (`_maps`): over a border, through the zeroth order, through every order, to the end and to every output within.
 
-The series of the motion is made once for all directions. Members stand in the lanes of a vector, and one direction
-after the other is followed; or the directions of a single member do, whose own series is then computed without lanes.
+The series of the motion is computed once for all directions. Lanes hold members, with one direction after another, or
+the directions of a single member, whose own series is then computed without lanes.
 
-A step that suits the motion may be too long for its tangents: about an equilibrium the series of the motion ends, that
-of a tangent does not. So the last two terms of their series are measured, and `excess` says how large they became; in
-the record, in the place of the number of a step, how large they were in this one.
+A step that is accurate for the motion may be too long for its tangents: about an equilibrium the series of the motion
+ends, that of a tangent does not. So the last two terms of their series are measured; `excess` is their largest size,
+and that of each step replaces its number in the record.
 """
 
 import functools
@@ -31,7 +31,7 @@ JOB = job(
 
 
 class Tangent:
-    """Builds the module; its public functions are `begin(job, memory, lanes)` and `run(job, memory, lanes, rounds)`."""
+    """The module of tangents, with public functions `begin(job, memory, lanes)` and `run(…, rounds)`."""
 
     job = JOB
 
@@ -62,7 +62,7 @@ class Tangent:
     # ---- rounds ----
 
     def _run_function(self, steps: list[Code]) -> None:
-        """`run(job, memory, lanes, rounds)`: one step in every lane a round; 1 if there is more to do."""
+        """Emit `run(job, memory, lanes, rounds)`: one step per lane and round; 1 if there is more to do."""
         frame = self.motion.function("run", INTEGER, result=INTEGER, public=True)
         code, (rounds,) = frame.code, frame.arguments
         directions, per_group = frame.job("directions"), self.directions.lanes // self.motion.width
@@ -86,7 +86,7 @@ class Tangent:
             lane["is_hit"] = 0.0
 
     def _set_step_end(self, frame: Frame) -> None:
-        """Set the beginning of the next step of every lane, up to which outputs belong to this one."""
+        """Set the start of the next step of every lane: outputs before it belong to this step."""
         code = frame.code
         with code.loop(self.motion.width) as index:
             lane = frame.lane(index)
@@ -115,7 +115,7 @@ class Tangent:
         return frame, frame.code, frame.arguments[0]
 
     def _load(self) -> Code:
-        """`(group)`: the tangents of the state and of the parameters; zero where there is no such direction."""
+        """Emit `(group)`: load the tangents of state and parameters; zero for a direction that does not exist."""
         frame, code, group = self._step_function("take")
         for i in self.form.each(code, self.motion.states):
             frame["dy", i, 0] = 0.0
@@ -139,7 +139,7 @@ class Tangent:
         return frame.finish()
 
     def _series(self, zeroth_order: ZerothOrder) -> Code:
-        """`(group)`: the series of the tangents of the state."""
+        """Emit `(group)`: compute the series of the tangents of the state."""
         frame, code, _ = self._step_function("series")
         zeroth_order.push(self.directions, frame)
         for i in self.form.each(code, len(self.motion.series.cauchy_products)):
@@ -151,15 +151,15 @@ class Tangent:
         return frame.finish()
 
     def _end(self) -> Code:
-        """`(group)`: the tangents of the state at the end of the series."""
+        """Emit `(group)`: compute the tangents of the state at the end of the series."""
         frame, _, _ = self._step_function("end")
         self.series_sum.push(self.directions, frame, "end", self.directions.number_of(frame, "h"), powers=True)
         return frame.finish()
 
     def _last_terms(self) -> Code:
-        """`(group)`: the largest of the last two terms, relative to the tangent itself; of coordinates, of velocities.
+        """Emit `(group)`: the largest of the last two terms relative to the tangent, of coordinates and velocities.
 
-        What is smaller than the `floor` counts as that: a tangent that is zero consists of rounding.
+        Tangents below the `floor` are replaced by it: a tangent that is zero consists of rounding.
         """
         frame, code, _ = self._step_function("measure")
         order, powers = frame.job("order"), [frame["power_before"], frame["power"]]
@@ -178,7 +178,7 @@ class Tangent:
         return frame.finish()
 
     def _outputs(self) -> Code:
-        """`(group)`: the tangents of the outputs from the beginning of the step to that of the next one."""
+        """Emit `(group)`: the tangents of the outputs between the starts of this step and the next."""
         frame, code, group = self._step_function("outputs")
         frame["is_due"] = 1.0
         with code.repeat_while(lambda: code.any_lane(frame["is_due"] > 0.0)):
@@ -191,7 +191,7 @@ class Tangent:
         return frame.finish()
 
     def _find_due_outputs(self, frame: Frame, index: Value) -> None:
-        """Flag the lanes whose next output lies in the step (`is_due`), and note its time from the beginning (`s`)."""
+        """Set `is_due` for lanes whose next output is in the step, and its time `s` from the start of the step."""
         code, lane, of_motion = frame.code, frame.lane(index), self.directions.lane_of_motion(frame, index)
         member, output = of_motion["member"], code.as_integer(lane["next_output"])
         inside = (member >= 0) & (output < frame.job("times") - 1)
@@ -214,7 +214,7 @@ class Tangent:
             lane["next_output"] = lane["next_output"] + 1.0
 
     def _store_end(self) -> Code:
-        """`(group)`: write down the tangents of the end of the step, with which the next one begins."""
+        """Emit `(group)`: store the tangents at the end of the step, with which the next one begins."""
         frame, code, group = self._step_function("leave")
         with code.loop(self.directions.lanes) as index:
             lane, (place, there) = frame.lane(index), self.directions.place(frame, group, index)

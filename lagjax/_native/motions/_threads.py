@@ -1,11 +1,11 @@
-"""Machine code on several threads that an interrupt can stop.
+"""Machine code on several threads, which an interrupt can stop.
 
-Python looks at signals, and raises `KeyboardInterrupt`, on the main thread and between its own instructions only. Code
-that ran for a minute would keep it waiting for a minute. So it runs in slices of a few hundredths of a second, on the
-calling thread as on the others; whoever raises between two slices ends the work of all.
+Python handles signals, and raises `KeyboardInterrupt`, on the main thread and between its own instructions only; code
+that runs for a minute would delay it by a minute. So machine code runs in slices of a few hundredths of a second, on
+the calling thread as on the others; an exception between two slices ends the work of all.
 
 Threads are started for each run, which costs less than a member does, and end with it: there is nothing that a fork
-could lose or that the end of the interpreter would wait for.
+could lose or for which the end of the interpreter would wait.
 """
 
 import _thread
@@ -18,7 +18,7 @@ SLICE = 0.03  # seconds, more or less: a tenth of what a hand at the keyboard no
 
 
 def run_in_slices(run: Callable[[int], int], stopped: Callable[[], bool], rounds: int) -> None:
-    """Call `run(rounds)` until it returns 0 or `stopped()`: with these `rounds`, then as many as take a `SLICE`."""
+    """Call `run(rounds)` until it returns 0 or `stopped()`; `rounds` is adapted so that a call takes a `SLICE`."""
     while not stopped():
         begin = time.perf_counter()
         if not run(rounds):
@@ -31,10 +31,10 @@ def run_in_slices(run: Callable[[int], int], stopped: Callable[[], bool], rounds
 
 
 def run_on_threads(work: Callable[[Callable[[], bool]], int], count: int) -> int:
-    """The sum of what `work(stopped)` returns on `count` threads, of which the caller's is one.
+    """Call `work(stopped)` on `count` threads, including the caller's; the sum of the results.
 
-    Raises what one of them raises, after all have ended: `stopped()` tells the others. All that the work needs must
-    hang on `work`, so that no thread outlives it.
+    If one raises, `stopped()` becomes true for the others, and the exception is raised after all have ended. `work`
+    must own all that it needs, so that no memory is freed while a thread runs.
     """
     if count == 1:  # there is no other thread to stop, or to wait for
         return work(lambda: False)
@@ -70,7 +70,7 @@ def run_on_threads(work: Callable[[Callable[[], bool]], int], count: int) -> int
 
 
 def _wait_for_helpers(helpers: int, ended: list, signal: queue.SimpleQueue, stop: threading.Event) -> None:
-    """Wait until all helpers have ended. An interrupt stops the helpers, and is raised when they have ended."""
+    """Wait until all helper threads have ended; an interrupt stops them first, and is raised afterwards."""
     interrupt = None
     while len(ended) < helpers:
         try:

@@ -1,4 +1,4 @@
-"""The cotangents of a step, in the memory of its motion: where the pullbacks of its maps read and add."""
+"""The memory of the cotangents of a step: where the pullbacks of its maps read and add."""
 
 from lagjax._native.code._constants import MAX_ORDER
 from lagjax._native.code._frame import Frame, Index, Numbers, Vectors
@@ -10,14 +10,14 @@ from lagjax._program import Table
 
 
 class Cotangents:
-    """Functions that add to the cotangents of a motion; the field `x_ct` has those of the field `x`."""
+    """Kernel functions that add cotangents of a motion; the field `x_ct` has the cotangents of the field `x`."""
 
     def __init__(self, motion: TaylorSeries, parts: MotionParts):
         self.motion, self.varied = motion, parts.varied
 
     @staticmethod
     def fields(parts: MotionParts) -> dict:
-        """The fields of a thread's memory: the cotangents of the state, of its series and of what that is made of."""
+        """The fields of a thread's memory for the cotangents of the state, its series and their rows."""
         series, states = parts.series, 2 * parts.series.size
         return {
             "state_ct": states,
@@ -28,7 +28,7 @@ class Cotangents:
         }
 
     def store(self, frame: Frame, cotangents: Numbers, more: "Vectors | None" = None) -> None:
-        """The cotangent of the state takes the place of the one before, with `more`; those of the parameters add up."""
+        """Set the cotangent of the state, plus `more`, and add the cotangents of the parameters."""
         form, states = self.motion.form, self.motion.states
         for i in form.each(frame.code, states):
             frame["state_ct", i] = cotangents[i] if more is None else more[i] + cotangents[i]
@@ -41,7 +41,7 @@ class Cotangents:
                 add(frame, cotangents[states + k], "params_ct", i)
 
     def store_entries(self, frame: Frame, tables: tuple[Table, ...], out: Numbers, first: int) -> None:
-        """Add the cotangents of entries of tables, outputs from the `first` on, to those of the numbers of members."""
+        """Add the cotangents of table entries, in `out` from `first` on, to those of the members' parameters."""
         code, motion = frame.code, self.motion
         for k, table in enumerate(tables):
             cotangent = out[first + 2 * k + 1]

@@ -1,4 +1,4 @@
-"""Guards: functions of the state that are watched along a motion, as part of the program of its acceleration."""
+"""Guards: functions of the state whose sign is watched along a motion; they are part of its program."""
 
 import functools
 from typing import NamedTuple
@@ -8,16 +8,17 @@ from lagjax._program import Borders, Recurrent, Series, StraightLine, Unlowerabl
 
 
 class Guards(NamedTuple):
-    """Functions of the state that are watched, and for each −1, 0 or +1: when a change of its sign counts.
+    """Functions gᵢ of the state that are watched; `directions` (−1, 0 or +1) says which sign changes count.
 
-    That ends the motion or, with `notes`, is written down. `values` gives all g. With y the state and the time, the
-    outputs of `program` are all g; their rates ġ = Σ ∂g/∂yᵢ ẏᵢ; then Σ |∂g/∂yᵢ yᵢ| and Σ |∂g/∂yᵢ ẏᵢ|, of which
-    round-off is a part; and, if there are five of each guard, how far the rounding of a start in float32 moves it. A
-    motion that `remembers` has two numbers more for each guard, behind its parameters: how far rounding may have moved
-    them, with the sign of the side from which the motion comes, 0 where that is unknown, and infinite where a motion
-    that is beyond the surface has changed its side wherever it goes; then how far rounding may have moved their rates.
-    Of a start that `is_rounded`, more coarsely than the motion, a guard that is zero to rounding is zero: its surface
-    passes through the start. A guard that `holds` ends a motion at once that begins beyond it, in its direction.
+    A change that counts ends the motion or, with `notes`, is recorded. `values` computes all g. The outputs of
+    `program` are, with y the state and the time: all g; their rates ġ = Σ ∂g/∂yᵢ ẏᵢ; then Σ |∂g/∂yᵢ yᵢ| and Σ |∂g/∂yᵢ
+    ẏᵢ|, the scales of their rounding errors; and, if there are five per guard, the error due to a start rounded to
+    float32.
+
+    With `remembers` a member has two further parameters per guard: the rounding error of g, with the sign of the side
+    from which the motion comes (0: unknown; infinite: a motion beyond the surface has changed its side in any case),
+    and the rounding error of ġ. With `is_rounded` the start is rounded more coarsely than the motion: a guard that is
+    zero to that rounding is zero. A guard that `holds` ends at once a motion that starts beyond it, in its direction.
     """
 
     values: Recurrent
@@ -30,12 +31,12 @@ class Guards(NamedTuple):
 
     @property
     def inputs(self) -> int:
-        """The count of numbers of a member that are remembered."""
+        """The number of parameters of a member that guards remember."""
         return 2 * len(self.directions) if self.remembers else 0
 
 
 class Watched(NamedTuple):
-    """A program with guards, and how rounding moves them, as its last outputs; the series of both, and its borders."""
+    """A program whose last outputs are guards and their rounding errors, its series, and its borders."""
 
     program: Recurrent
     series: Series
@@ -44,7 +45,7 @@ class Watched(NamedTuple):
 
 @functools.lru_cache(maxsize=32)
 def append_guards(program: Recurrent, size: int, values: Recurrent, slides: bool) -> Watched:
-    """A program of q̈ with guards behind it. Raises `Unlowerable` where one of them has no series."""
+    """A program of q̈ with guards as further outputs. Raises `Unlowerable` if a guard has no series."""
     count = len(values.line.outputs)
     whole = with_outputs(program, values.line, 2 * size + 1)
     require_lanes(whole.line)
@@ -57,7 +58,7 @@ def append_guards(program: Recurrent, size: int, values: Recurrent, slides: bool
 
 
 def require_lanes(line: StraightLine) -> None:
-    """Raise `Unlowerable` where the lanes of a kernel cannot run a program."""
+    """Raise `Unlowerable` if a program has integer operations that vectors of doubles cannot compute."""
     for (op, _, _), kind in zip(line.nodes, line.kinds, strict=True):
         if kind not in ("float", "bool") and op not in ("input", "constant", "convert", *INTEGERS):
             raise Unlowerable(f"`{op}` of integers is not for vectors of doubles")

@@ -1,4 +1,4 @@
-"""The operations of a scalar program on vectors, one lane for each member of a batch."""
+"""The operations of a scalar program on vectors, one lane per member of a batch."""
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
@@ -13,7 +13,7 @@ from lagjax._program import LOOK_UPS, OPERATIONS, StraightLine, Unlowerable
 
 
 class Lines:
-    """The form of small kernels: every operation is written down, and every component of the state (else `Tables`)."""
+    """The form of small kernels: every operation, for every component of the state, is emitted (else see `Tables`)."""
 
     def __init__(self, sincos: Code, look_up: Callable):
         self._sincos, self._look_up = sincos, look_up
@@ -21,7 +21,7 @@ class Lines:
     def run(
         self, frame: Frame, line: StraightLine, *inputs: "Sequence[Value] | Vectors", to: "Vectors | None" = None
     ) -> Numbers:
-        """The outputs of a program of all these inputs; a bool is 1 or 0. The last go `to` some other place, too."""
+        """The outputs of a line for the concatenated `inputs`; a bool is 1 or 0. The last ones also go to `to`."""
         parts = [(values, i) for values in inputs for i in range(len(values))]
 
         def read(position):
@@ -37,11 +37,11 @@ class Lines:
         return out
 
     def each(self, code: Code, count: int) -> Iterator[int]:
-        """The numbers from 0 to `count`, for a body that is written down for each of them."""
+        """The Python integers below `count`: the body is emitted for each of them."""
         return iter(range(count))
 
     def strands(self, code: Code, n: int) -> Iterator[tuple[list, dict]]:
-        """The components of a state of n coordinates, four at a time; and which of these are velocities: of what."""
+        """Groups of four components of a state (q, q̇); for the velocities in it {index: coordinate}."""
         for first in range(0, 2 * n, 4):
             some = list(range(first, min(first + 4, 2 * n)))
             yield some, {k: i - n for k, i in enumerate(some) if i >= n}
@@ -50,11 +50,11 @@ class Lines:
         return [None] * count
 
     def largest(self, code: Code, numbers: Callable[[int], Value], count: int) -> Value:
-        """The largest of this many numbers, which are not negative; NaN where the last one is."""
+        """The largest of `count` nonnegative numbers; NaN if the last one is NaN."""
         return functools.reduce(code.maximum, map(numbers, range(count)))
 
     def largest_by_group(self, frame: Frame, numbers: Callable[[int], Value], groups: Sequence[int]) -> Numbers:
-        """The largest number of the group of each: of those with the same number in `groups`."""
+        """For each number the largest one in its group, where `groups` has a group number for each."""
         largest: dict[int, Value] = {}
         for i, group in enumerate(groups):
             value = numbers(i)
@@ -62,16 +62,16 @@ class Lines:
         return [largest[group] for group in groups]
 
     def prepare(self, frame: Frame) -> None:
-        """Prepare the memory of a thread, once."""
+        """Initialise the memory of a thread: nothing to do in this form."""
 
     def finish(self) -> None:
-        """After all programs of the kernel."""
+        """Complete the kernel after its last program: nothing to do in this form."""
 
 
 def emit(
     code: Code, line: StraightLine, inputs: Callable[[int], Value], sincos: Code | None, look_up: Callable | None
 ) -> list[Value]:
-    """The outputs of a line, whose input i is `inputs(i)`, a vector; integers are doubles. `look_up` reads tables."""
+    """Emit a line: input i is the vector `inputs(i)`, integers are doubles, `look_up` reads tables. Its outputs."""
     values: list[Value] = []
     turns: dict[int, tuple[Value, Value]] = {}
     for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):
@@ -96,7 +96,7 @@ def emit(
 
 
 def apply(code: Code, op: str, xs: list[Value], attribute, kinds: Sequence[str], kind: str) -> Value:
-    """An operation of operands of these `kinds` by its row: of the C library, lane by lane, or written with vectors."""
+    """Emit one operation on operands of `kinds`: on vectors, or by the C library in each lane."""
     if op == "convert":
         return _convert_integer(code, xs[0], kinds[0], kind)
     is_whole = kind not in ("float", "bool")
@@ -111,7 +111,7 @@ def apply(code: Code, op: str, xs: list[Value], attribute, kinds: Sequence[str],
 
 
 def _combine_bits(op: str) -> Callable:
-    """An operation on the bits of whole doubles; NaN where one of them is none."""
+    """A function that emits a bitwise operation on whole doubles; NaN where an operand is NaN."""
 
     def combine(code, a, b):
         x, y = (code.builder.fptosi(of.it, ir.VectorType(INTEGER, code.lanes)) for of in (a, b))
@@ -145,13 +145,13 @@ INTEGERS = {
 
 
 def _multiply_words(kind: str, code: Code, a: Value, b: Value) -> Value:
-    """A product of integers of 32 bits, less what wraps: of each half of one of them a double holds it exactly."""
+    """The product of two 32-bit integers in doubles, wrapped as the type does; each partial product is exact."""
     high = code.intrinsic("floor", a * 2.0**-16)
     return _wrap_integer(code, high * b, kind) * 2.0**16 + (a - high * 2.0**16) * b
 
 
 def _wrap_integer(code: Code, x: Value, kind: str) -> Value:
-    """An integer as its type holds it: what is too large for one of up to 32 bits begins anew below."""
+    """An integer wrapped into the range of its type, if that has up to 32 bits; else `_check_range`."""
     low, period = float(np.iinfo(kind).min), 2.0 ** np.iinfo(kind).bits
     if period > 2.0**32:
         return _check_range(code, x, kind)
@@ -159,7 +159,7 @@ def _wrap_integer(code: Code, x: Value, kind: str) -> Value:
 
 
 def _check_range(code: Code, x: Value, kind: str) -> Value:
-    """An integer, or NaN and not another one where its type does not hold it, or no double holds it exactly."""
+    """An integer, or NaN where it is outside of its type's range or not exact in a double."""
     limits = np.iinfo(kind)
     low, high = max(int(limits.min), -(2**53)), min(int(limits.max), 2**53)
     return code.select((x >= float(low)) & (x <= float(high)), x, float("nan"))
@@ -178,10 +178,10 @@ COS = (4.16666666666666019037e-02, -1.38888888888741095749e-03, 2.48015872894767
 
 
 def sincos_function(module: ir.Module, lanes: int, name: str = "sincos", rounds: bool = False) -> Code:
-    """`(x, address)`: sin x and cos x, stored one after the other.
+    """Emit `(x, address)`: store sin x, then cos x, at the address.
 
-    Cody and Waite's reduction (*Software Manual for the Elementary Functions*, 1980), fdlibm's polynomials; 1 ulp. A
-    vector with an angle beyond `LARGEST_ANGLE` asks the C library as well.
+    Cody and Waite's reduction (*Software Manual for the Elementary Functions*, 1980), fdlibm's polynomials; error 1
+    ulp. If a lane has an angle beyond `LARGEST_ANGLE`, the C library is called as well.
     """
     code = Code(module, name, [ir.VectorType(DOUBLE, lanes), POINTER], lanes, rounds=rounds)
     x, address = code.arguments
@@ -215,7 +215,7 @@ def _sincos_polynomials(code: Code, x: Value) -> tuple[Value, Value]:
 
 
 def _rotate_quarters(code: Code, k: Value, sine: Value, cosine: Value) -> tuple[Value, Value]:
-    """Sine and cosine of an angle that is k quarters of a turn larger."""
+    """Sine and cosine of an angle increased by k quarter turns, from those of the angle."""
     quadrant = k - 4.0 * code.intrinsic("floor", 0.25 * k)  # 0, 1, 2, 3
     odd = code.compare("==", quadrant, 1.0) | code.compare("==", quadrant, 3.0)
     s, c = code.select(odd, cosine, sine), code.select(odd, sine, cosine)

@@ -1,4 +1,4 @@
-"""The programs that a kernel is made from: those of a motion, its series, and the borders between its pieces."""
+"""The programs that a kernel is made from: those of a motion, its Taylor series, and the borders between its pieces."""
 
 import functools
 from dataclasses import replace
@@ -11,7 +11,7 @@ from lagjax._program import (
     Borders,
     Jump,
     Nesting,
-    Pieced,
+    PiecedProgram,
     Recurrent,
     Series,
     Unlowerable,
@@ -24,10 +24,10 @@ from lagjax._program import (
 
 
 class Projection(NamedTuple):
-    """The programs that keep a motion on its constraints: two of (q, q̇, t, parameters).
+    """Two programs of (q, q̇, t, parameters) that keep a motion on its constraints.
 
-    `state` gives the projected state (q, q̇), 2n numbers. `velocity_scale` gives n numbers: an error of a velocity
-    counts relative to its scale where that is larger than the velocity itself.
+    `state` gives the projected state (q, q̇), 2n numbers. `velocity_scale` gives n numbers: the error of a velocity is
+    measured relative to its scale if that is larger than the velocity.
     """
 
     state: Recurrent
@@ -35,21 +35,21 @@ class Projection(NamedTuple):
 
 
 class Chosen(NamedTuple):
-    """The numbers of a member that a motion computes with: those at `positions`, of a total of `of`."""
+    """The parameters of a member that a motion computes with: those at `positions` among `of`; tables read the rest."""
 
     positions: tuple[int, ...]
     of: int
 
 
 class MotionParts(NamedTuple):
-    """A motion as its kernels take it: what an integrator, its tangents and its adjoint are built from.
+    """The parts of a motion from which its integrator, its tangents and its adjoint are built.
 
     - `program`: q̈ and whether the mass matrix is singular, then numbers that are followed along a step. Its last inputs
       are the pieces, where there are `borders` between some.
     - `series`: the Taylor series of the motion along a piece.
     - `nesting`: which of the coordinates are tangents of others.
-    - `projection`: the way back to the constraints; `chosen`: the numbers of a member that it computes with. None where
-      there are no constraints, or where these are all numbers.
+    - `projection`: that onto the constraints; None without constraints. `chosen`: the parameters of a member that the
+      programs compute with; None for all.
     """
 
     program: Recurrent
@@ -66,23 +66,23 @@ class MotionParts(NamedTuple):
 
     @property
     def kicks(self) -> bool:
-        """True if L jumps at borders, where the velocities do so, too."""
+        """True if L jumps at a border, so that velocities do."""
         return self.borders is not None and bool(self.borders.kicking)
 
     @property
     def varied(self) -> list[int]:
-        """The inputs of the program that derivatives are taken by: all floats but the time and the pieces."""
+        """The positions of the inputs with derivatives: all floats except the time and the pieces."""
         dtypes, time = self.program.dtypes, 2 * self.series.size
         moving = dtypes[: len(dtypes) - self.pieces]
         return [i for i, dtype in enumerate(moving) if dtype.kind == "f" and i != time]
 
     @property
     def numbers_of_motion(self) -> int:
-        """The count of those numbers of a member that the motion itself has, where tables look up some; else 0."""
+        """The number of parameters of a member of the motion without tangents, if tables read some of them; else 0."""
         return 0 if self.chosen is None else self.chosen.of * self.nesting.base // self.nesting.size
 
     def jump(self, over_steps: bool) -> Jump | None:
-        """The jump at a border of tangents, or of a derivative `over_steps` that have been taken; None without any."""
+        """The jump of tangents at borders; None without tangents. `over_steps` adds a derivative of taken steps."""
         nesting = self.nesting.with_tangents(1) if over_steps else self.nesting
         if not self.pieces or self.borders is None or not nesting.directions:
             return None
@@ -92,11 +92,11 @@ class MotionParts(NamedTuple):
     def from_program(
         cls, program: Recurrent, size: int, projection: Projection | None = None, chosen: Chosen | None = None
     ) -> "MotionParts":
-        """The parts of a motion over `size` coordinates without borders, or whose borders do not matter."""
+        """The parts of a motion with `size` coordinates whose borders, if any, are ignored."""
         return cls(program, recurrences(program, size), Nesting(size), projection, chosen=chosen)
 
     def append_guards(self, nesting: Nesting, guards: Guards | None, motion: Recurrent | None) -> "MotionParts":
-        """The parts of a run, from those of the smooth motion: along its pieces, with guards behind q̈."""
+        """The parts of a run, from those of the smooth motion: with pieces, and with guards as outputs after q̈."""
         size, whole = nesting.size, self._replace(nesting=nesting)
         if guards is not None:
             program, series, found = append_guards(self.program, size, guards.values, not nesting.directions)
@@ -108,7 +108,7 @@ class MotionParts(NamedTuple):
 
     @property
     def drop_guards(self) -> "MotionParts":
-        """The parts of a piecewise motion without the guards behind q̈."""
+        """The parts of a piecewise motion without its guards."""
         assert self.borders is not None
         of, size = self.borders.program, self.nesting.size
         program = replace(of, line=of.line.replace(outputs=of.line.outputs[: size + 1]))
@@ -119,9 +119,9 @@ class MotionParts(NamedTuple):
 def choose_parameters(
     program: Recurrent, projection: Projection | None, guards: Guards | None, motion: Recurrent | None, nesting: Nesting
 ) -> "tuple[Recurrent, Projection | None, Guards | None, Recurrent | None, Chosen | None]":
-    """The programs with the parameters that they compute with, where they look up others in tables; and which.
+    """The programs reduced to the parameters that they compute with, tables reading the rest; and which ones these are.
 
-    What is a parameter of one row of the `nesting` is one of each; `motion` is the program of the first row alone.
+    The same parameters are chosen in every row of the `nesting`; `motion` is the program of the first row alone.
     """
     first, rows = 2 * nesting.size + 1, nesting.size // nesting.base
     programs: list = [program]
@@ -152,7 +152,7 @@ def choose_parameters(
 
         dtypes = (*one.dtypes[:first], *(kinds[i] for i in positions))
         size, mechanics = first + len(positions), reduce_line(getattr(one, "mechanics", None))
-        return Pieced(reduce_line(one.line), size, dtypes, one.linear, mechanics)
+        return PiecedProgram(reduce_line(one.line), size, dtypes, one.linear, mechanics)
 
     done = iter([reduce_program(one) for one in programs])
     return (
@@ -166,13 +166,13 @@ def choose_parameters(
 
 @functools.lru_cache(maxsize=16)  # used where the engine is chosen, and where it is compiled
 def recurrences(program: Recurrent, size: int) -> Series:
-    """The Taylor series of the motion. Raises `Unlowerable` where the lanes of a kernel cannot run it."""
+    """The Taylor series of a smooth motion. Raises `Unlowerable` if vectors of doubles cannot compute the program."""
     require_lanes(program.line)
     return series(program, size, moving=2 * size + 1)
 
 
 def series_of_pieces(program: Recurrent, size: int, found: Borders) -> Series:
-    """The Taylor series of a motion along a piece, and of its switching numbers."""
+    """The Taylor series of a motion along a piece, and of its switching numbers and feature arguments."""
     return series(program, size, moving=2 * size + 1, followed=found.followed)
 
 
@@ -180,9 +180,9 @@ def series_of_pieces(program: Recurrent, size: int, found: Borders) -> Series:
 def pieces_of(
     program: Recurrent, nesting: Nesting, motion: Recurrent | None = None, member: int = 0
 ) -> "tuple[Borders, Series] | None":
-    """The borders of a piecewise program, and the series of its motion along a piece; None where there are none.
+    """The borders of a piecewise program, and the series of its motion along a piece; None if it is smooth.
 
-    With tangents they are those of the `motion` alone, which has `member` numbers of a member; these are shifted.
+    With tangents the borders are those of the `motion` alone, which has `member` parameters, renumbered.
     """
     size = nesting.size
     if nesting.directions:

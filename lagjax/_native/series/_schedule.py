@@ -1,11 +1,11 @@
-"""The order in which a large program runs, and where its numbers lie: alike operations side by side.
+"""The order of operations of a large program, and the memory slots of its results: equal operations are adjacent.
 
-    operations   what the outputs need; sine and cosine of one angle are one operation with two results
-    joined       operations that often come together are one: a product and the sum that reads it, and then larger trees
-    groups       alike operations that wait for equally many others, and so not for each other
-    slots        where every result lies, from its making to its last use
+    operations   those that the outputs need; sine and cosine of one angle are one operation with two results
+    joined       operations that often occur together become one: a product and its sum, and then larger trees
+    groups       equal operations at the same depth, which are independent of each other
+    slots        where every result is stored, from its computation to its last use
 
-Nothing here knows LLVM.
+This file does not depend on LLVM.
 """
 
 from collections import Counter
@@ -19,9 +19,9 @@ _JOINED = frozenset(("add", "sub", "mul", "neg", "div", "sqrt"))
 
 
 class OperationKind(NamedTuple):
-    """The kind of an operation: its name and attribute, and the kinds ("float", "bool", …) of operands and result.
+    """A kind of operation: its name and attribute, and the kinds ("float", "bool", …) of its operands and its result.
 
-    `parts` has an entry for each operand: the operation that it is the result of, if that belongs to this one, or None.
+    `parts` has one entry per operand: None, or the kind of the operation that computes it, joined into this one.
     """
 
     op: str
@@ -43,7 +43,7 @@ _Kinds = dict[OperationKind, int]  # the kinds of the operations of a program, n
 
 
 class ScheduledOperation(NamedTuple):
-    """An operation: its kind, as a number, the nodes that it reads, and those that it makes (-1: unused)."""
+    """One operation: the number of its kind, the nodes that it reads, and those it computes (−1: unused)."""
 
     kind: int
     operands: tuple[int, ...]
@@ -51,12 +51,11 @@ class ScheduledOperation(NamedTuple):
 
 
 class Schedule(NamedTuple):
-    """A program in the order in which it runs.
+    """A program in the order of its execution.
 
-    Every group holds operations of one of the `kinds`. Node i lies in slot `slots[i]`, of which there are `size`; the
-    outputs that are `staying` lie in the first slots, in their order, and the others are stored: of a program of N
-    nodes, output k is node N + k then, and has no slot. `inputs` gives the position of every node that is an input, and
-    `constants` the number of one that is a number.
+    Each group has operations of one of the `kinds`. Node i is in slot `slots[i]` of `size` slots. The first `staying`
+    outputs occupy the first slots in order; the rest are stored elsewhere: for a program of N nodes, output k is node N
+    + k and has no slot. `inputs` maps a node to its input position, `constants` a node to its number.
     """
 
     kinds: list[OperationKind]
@@ -69,7 +68,7 @@ class Schedule(NamedTuple):
 
 
 def schedule(line: StraightLine, stored: int) -> Schedule:
-    """The order of operations that outputs need, and slots of results; the last outputs are `stored` elsewhere."""
+    """The schedule of a line; its last `stored` outputs are stored elsewhere and get no slots."""
     nodes, uses = line.nodes, count_uses(line.nodes, line.outputs)
     kinds: _Kinds = {}
     operations = _join_pairs(_needed_operations(line, uses, kinds), uses, kinds)
@@ -92,7 +91,7 @@ def _number(kinds: _Kinds, kind: OperationKind) -> int:
 
 
 def _needed_operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[ScheduledOperation]:
-    """The operations that the outputs need, each after those that it reads."""
+    """The operations on which the outputs depend, operands first; sine and cosine of an angle are one."""
     angles: dict[int, list[int]] = {}  # the nodes of the sine and the cosine of each; -1 where one is not needed
     for i, (op, operands, _) in enumerate(line.nodes):
         if uses[i] and op in ("sin", "cos"):
@@ -115,7 +114,7 @@ def _needed_operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> li
 def _separate_outputs(
     line: StraightLine, operations: list[ScheduledOperation], kinds: _Kinds, staying: int
 ) -> tuple[dict[int, int], list[ScheduledOperation]]:
-    """The node of each output: a node that is an output already is copied, for output k of N nodes to node N + k."""
+    """The node of each output, and copies: an output that repeats, or is no result, is copied to node N + k."""
     made = {x for operation in operations for x in operation.results}
     outputs: dict[int, int] = {}
     copies = []
@@ -134,9 +133,9 @@ def _separate_outputs(
 
 
 def _join_pairs(operations: list[ScheduledOperation], uses: list[int], kinds: _Kinds) -> list[ScheduledOperation]:
-    """The operations, with a result that only one other reads computed inside that one, where such a pair comes often.
+    """The operations with frequent pairs joined: a result with one reader is computed inside of it.
 
-    Pairs of pairs come often too, and so on: byte-pair encoding, with trees for strings.
+    Pairs of pairs are joined as well, and so on, as in byte-pair encoding, with trees in place of strings.
     """
     made = {max(operation.results): operation for operation in operations}
     ops = [kind.op for kind in kinds]
@@ -161,9 +160,9 @@ def _join_pairs(operations: list[ScheduledOperation], uses: list[int], kinds: _K
 
 
 def _frequent_pairs(pairs: Counter, kinds: _Kinds) -> dict[int, tuple[int, int, int]]:
-    """The pairs that come most often: for kinds of operations the operand that is joined, its kind, and that of both.
+    """The most frequent pairs: {kind: (operand to join, its kind, the kind of both)}.
 
-    In one round a kind takes an operand in or is taken in by others, but for chains of one kind.
+    In one round a kind either absorbs an operand or is absorbed, except in chains of one kind.
     """
     chosen: dict[int, tuple[int, int, int]] = {}
     parts, numbered = set(), list(kinds)
@@ -179,7 +178,7 @@ def _frequent_pairs(pairs: Counter, kinds: _Kinds) -> dict[int, tuple[int, int, 
 
 
 def _insert_part(kind: OperationKind, place: int, part: OperationKind) -> OperationKind:
-    """The kind in which the operand at this place is replaced by the operation that computes it."""
+    """The kind in which the operand at this place is replaced by the operation `part` that computes it."""
     parts = list(kind.parts)
     for k, inner in enumerate(parts):
         width = 1 if inner is None else inner.operands
@@ -194,7 +193,7 @@ def _insert_part(kind: OperationKind, place: int, part: OperationKind) -> Operat
 
 
 def _group_by_level(operations: list[ScheduledOperation], nodes: int) -> list[list[ScheduledOperation]]:
-    """Operations of one kind that wait for equally many others, and so not for each other; in order."""
+    """Operations grouped by depth and kind, in order: operations of a group are independent of each other."""
     levels, alike = [-1] * (nodes + 1), {}  # the last one is that of results that are unused
     for operation in operations:
         level = 1 + max([levels[i] for i in operation.operands], default=-1)
@@ -210,10 +209,10 @@ def _group_by_level(operations: list[ScheduledOperation], nodes: int) -> list[li
 def _allocate_slots(
     groups: list[list[ScheduledOperation]], outputs: dict[int, int], count: int, nodes: int
 ) -> tuple[dict[int, int], int]:
-    """A slot for every result, the one that became free last first; inputs and constants have none here.
+    """A slot for each result, most recently freed first, and the number of slots; inputs and constants get none.
 
-    The first `count` outputs come first and keep theirs, and what is stored, from node `nodes` on, has none. Results of
-    a group get their slots before its operands give theirs back: the group may read and write in any order.
+    The first `count` outputs keep the first slots; nodes from number `nodes` on are stored elsewhere. Results of a
+    group get slots before its operands free theirs, so that a group may read and write in any order.
     """
     slots, free, size = dict(outputs), [], count
     last = {x: g for g, group in enumerate(groups) for operation in group for x in operation.operands}

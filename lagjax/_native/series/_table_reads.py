@@ -1,10 +1,10 @@
-"""Look-ups in tables (`_program._look_ups`): entries are read from memory, where the numbers of a member lie.
+"""Look-ups in tables (`_program._look_ups`), read from the parameters of a member in memory.
 
-    take      an entry at a whole number, which is clipped to the table: no lane reads what is not there
-    locate    the piece of an increasing table, by bisection; needed where a motion begins, not along it
+    take      an entry by a whole number, clipped to the table so that no lane reads outside of it
+    locate    the interval of an increasing table, by bisection; needed at the start of a motion only
 
-Tables that consist of numbers of the program lie in one array, whose address the module is given once it is compiled:
-they are part of no text that LLVM reads.
+Constant tables are in one array, whose address is passed to the module after compilation, so that they are not part of
+the text that LLVM parses.
 """
 
 import functools
@@ -21,7 +21,7 @@ SET_NUMBERS = "set_numbers"
 
 
 class LookUps:
-    """The look-ups of a module, in programs of `Chosen` numbers of a member: tables count from `BESIDE`."""
+    """The look-ups of a module; if its parameters are `Chosen`, tables are counted from `BESIDE`."""
 
     def __init__(self, module: ir.Module):
         self.module = module
@@ -30,11 +30,11 @@ class LookUps:
 
     @property
     def numbers(self) -> np.ndarray | None:
-        """All tables of numbers end to end; None where there are none."""
+        """All constant tables in one array; None if there are none."""
         return np.concatenate([np.frombuffer(data) for data in self._begins]) if self._begins else None
 
     def finish(self) -> None:
-        """After all programs of the module: a function that takes the address of the tables of numbers."""
+        """Emit the function that takes the address of the constant tables."""
         if self._begins:
             code = Code(self.module, SET_NUMBERS, [POINTER], 1, public=True)
             code.builder.store(code.arguments[0].it, self._address_of_numbers, align=8)
@@ -63,25 +63,25 @@ class LookUps:
         return found
 
     def increases(self, frame: Frame, table: Table, first: Value) -> Value:
-        """True if the entries of a table of the member whose numbers begin at `first` increase."""
+        """True if the entries of a table increase; `first` is the offset of the member's parameters."""
         code = frame.code
         begin = code.element(frame.job("params"), first + (table.first - BESIDE))
         constants = (code.as_value(n, INTEGER) for n in (table.stride, table.count))
         return code.call(self._increases_function, begin, *constants) > 0
 
     def places(self, frame: Frame, table: Table, x: Value) -> list[Value]:
-        """The places of entries with these numbers among the numbers of a member, lane by lane."""
+        """The offsets, lane by lane, of the entries with indices x among the parameters of all members."""
         x = self._clip_index(frame.code, table, x) * float(table.stride) + float(table.first - BESIDE)
         return self._to_integers(frame.code, x)
 
     @staticmethod
     def _clip_index(code: Code, table: Table, x: Value) -> Value:
-        """A number that the table has; of what is NaN the first."""
+        """Indices clipped to the table; NaN becomes 0."""
         x, last = code.select(x > 0.0, x, 0.0), float(table.count - 1)
         return code.select(x < last, x, last)
 
     def _table_base(self, frame: Frame, table: Table) -> tuple[Value, Value]:
-        """The address that doubles are counted from, and the number of the first entry in every lane."""
+        """The address of an array, and in each lane the index of the table's first entry in it."""
         code = frame.code
         if table.numbers is not None:
             if table.numbers not in self._begins:
@@ -100,7 +100,7 @@ class LookUps:
 
     @functools.cached_property
     def _increases_function(self) -> Code:
-        """`(base, stride, count)`: 1 where every entry is larger than the one before it, else 0."""
+        """Emit `(base, stride, count)`: 1 if every entry is larger than the one before it, else 0."""
         code = Code(self.module, "increases", [POINTER, INTEGER, INTEGER], 1, result=INTEGER)
         base, stride, count = code.arguments
         found = code.variable(code.as_value(1, INTEGER))
@@ -111,7 +111,7 @@ class LookUps:
 
     @functools.cached_property
     def _locate_function(self) -> Code:
-        """`(base, stride, count, closed, x)`: the number of entries that are at most x, less one."""
+        """Emit `(base, stride, count, closed, x)`: the number of entries that are at most x, less one."""
         code = Code(self.module, "locate", [POINTER, INTEGER, INTEGER, INTEGER, DOUBLE], 1, result=DOUBLE)
         base, stride, count, closed, x = code.arguments
         low, high = code.variable(code.as_value(0, INTEGER)), code.variable(count)
@@ -127,7 +127,7 @@ class LookUps:
 
     @staticmethod
     def _to_integers(code: Code, x: Value) -> list[Value]:
-        """The whole numbers in the lanes of a vector, as integers: below 2⁵³ a double is exact."""
+        """The whole numbers in the lanes of a vector, as a list of integers."""
         return _lane_values(code, Value(code, code.builder.fptosi(x.it, ir.VectorType(INTEGER, code.lanes))))
 
 

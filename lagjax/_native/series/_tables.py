@@ -1,13 +1,13 @@
-"""Large programs as tables: what is computed is data, and one loop of machine code runs all of it.
+"""Large programs as tables: the operations are data, which one loop of machine code executes.
 
-LLVM's time for a straight line grows faster than its length. Here a program is a row of integers,
+The time that LLVM needs grows faster than the length of a straight line. Here a program is an array of integers,
 
-    kind, then for each of `times` operations where its operands and its result lie;  kind, …;  0
+    kind, then for each of `times` operations the offsets of its operands and its result;  kind, …;  0
 
-and `execute` walks along it: a switch over the kinds of operations (some twenty) leads to their code, for `_schedule`
-puts alike operations side by side. Every number lies in the memory of the thread, so that what has been computed is
-read from the first or second cache instead of a register. The operations, and the order in which a sum adds up, are
-those of the straight line.
+and `execute` goes through it: a switch over the kinds of operations (some twenty) leads to their code, since
+`_schedule` puts equal operations next to each other. Every number is in the memory of the thread, so that results are
+read from the first or second cache instead of a register. The operations, and the order of each sum, are those of the
+straight line.
 """
 
 import struct
@@ -45,10 +45,10 @@ class Tables:
     def run(
         self, frame: Frame, line: StraightLine, *inputs: "Sequence[Value] | Vectors", to: "Vectors | None" = None
     ) -> Numbers:
-        """The outputs of a program, of which these are the inputs, one after the other; a bool is 1 or 0.
+        """The outputs of a line for the concatenated `inputs`; a bool is 1 or 0.
 
-        They stay until this place of the kernel is passed again. The last outputs go `to` some other place instead;
-        where the same program is run without one, nothing becomes of them.
+        They keep their values until the kernel runs this call again. The last outputs are stored in `to` instead; in a
+        call of the same line without `to` they are lost.
         """
         if line not in self._schedules:
             self._schedules[line] = schedule(line, 0 if to is None else len(to))
@@ -72,13 +72,13 @@ class Tables:
         return frame.vectors(name, plan.staying)
 
     def each(self, code: Code, count: int) -> Iterator[Value]:
-        """The numbers from 0 to `count`, for a body that is written down once, in a loop."""
+        """The integers below `count`, in an emitted loop: the body is emitted once."""
         if count:
             with code.loop(count) as i:
                 yield i
 
     def strands(self, code: Code, n: int) -> Iterator[tuple[list, dict]]:
-        """The components of a state of n coordinates: one coordinate and its velocity at a time; and which is that."""
+        """A loop over coordinates: each gives [coordinate, velocity], and {1: coordinate} for the velocity."""
         for i in self.each(code, n):
             yield [i, i + n], {1: i}
 
@@ -86,14 +86,14 @@ class Tables:
         return frame.vectors(self._table_field(count), count)
 
     def largest(self, code: Code, numbers: Callable[[Value], Value], count: int) -> Value:
-        """The largest of this many numbers, which are not negative; NaN where the last one is."""
+        """The largest of `count` nonnegative numbers; NaN if the last one is NaN."""
         largest = code.variable(code.lanes_of(0.0))
         for i in self.each(code, count):
             largest.value = code.maximum(largest.value, numbers(i))
         return largest.value
 
     def largest_by_group(self, frame: Frame, numbers: Callable[[Value], Value], groups: Sequence[int]) -> Numbers:
-        """The largest number of the group of each: of those with the same number in `groups`."""
+        """For each number the largest one in its group, where `groups` has a group number for each."""
         code, count, names = frame.code, len(groups), sorted(set(groups))
         values = self.room(frame, count)
         if len(names) == count:
@@ -112,11 +112,11 @@ class Tables:
         return values
 
     def prepare(self, frame: Frame) -> None:
-        """Prepare the memory of a thread, once: constants are numbers like all others."""
+        """Initialise the memory of a thread: store the constants."""
         frame.call(self._prepare.code)
 
     def finish(self) -> None:
-        """After all programs of the kernel: the loop with all kinds of operations that these have."""
+        """Complete the kernel after its last program: emit `execute`, with the kinds of operations that occur."""
         self._write_execute()
         self._write_prepare()
 
@@ -148,9 +148,10 @@ class Tables:
     # ---- the table of a program ----
 
     def _group_words(self, kind: OperationKind, group: list[ScheduledOperation], places: dict[int, int]) -> list[int]:
-        """The words of the table for a group of operations of one kind.
+        """The integers of the table for a group of operations of one kind.
 
-        For as many at a time as there is code for: the number of that code, then the places of operands and results.
+        Operations are taken in runs of lengths in `TIMES`, each with a kind number of its own, then operands and
+        results.
         """
         start, words = 0, []
         while start < len(group):
@@ -165,7 +166,7 @@ class Tables:
     # ---- the code ----
 
     def _write_execute(self) -> None:
-        """`(table, shift)`: run a program; what is stored lies this many doubles behind where the table says."""
+        """Emit `(table, shift)`: execute a table; outputs are stored `shift` doubles behind the table's offsets."""
         frame, code = self._execute, self._execute.code
         table, shift = frame.arguments
         at = code.variable(table)
@@ -189,7 +190,7 @@ class Tables:
         frame.finish()
 
     def _results(self, kind: OperationKind, operands: Iterator[Value]) -> tuple[Value, ...]:
-        """The results of an operation, from those of the numbers that it reads; a bool is 1 or 0."""
+        """The results of an operation, with the values of its operands from an iterator; a bool is 1 or 0."""
         code = self._execute.code
         xs = [next(operands) if part is None else self._results(part, operands)[0] for part in kind.parts]
         if kind.op in ("copy", "store"):
@@ -203,7 +204,7 @@ class Tables:
         return (code.as_number(result) if kind.result == "bool" else result,)
 
     def _write_prepare(self) -> None:
-        """`()`: every constant in its place, in all lanes."""
+        """Emit `()`: store every constant at its offset, in all lanes."""
         frame, code = self._prepare, self._prepare.code
         if self._constants:
             places = Value(code, integers(self._module, np.array([*self._constants.values()], np.int64)))

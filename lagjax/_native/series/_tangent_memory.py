@@ -1,4 +1,4 @@
-"""The tangents of a motion along directions, as functions of a kernel see them, in memory of their own."""
+"""The tangents of a motion along directions: their memory, and access to it in kernel functions."""
 
 from typing import Any
 
@@ -14,10 +14,10 @@ from lagjax._native.series._taylor import TaylorSeries, integer
 
 
 class Directions:
-    """The memory of the direction at hand in every lane, and the functions on it.
+    """The memory of the current direction of each lane, and the kernel functions that use it.
 
-    Vectors of the motion have its own width, those of its tangents `lanes`: as many, for as many members, or more, for
-    the directions of one. The field `dx` has the tangents of the motion's field `x`.
+    Vectors of the motion have its own width, those of its tangents `lanes`: equal, with one member per lane, or wider,
+    with the directions of one member side by side. The field `dx` has the tangents of the motion's field `x`.
     """
 
     def __init__(self, motion: TaylorSeries, parts: MotionParts, lanes: int):
@@ -45,7 +45,7 @@ class Directions:
     # ---- numbers of the motion, in a function of its tangents ----
 
     def numbers_of(self, frame: Frame, name: str, count: int, place=lambda i: (i,), in_place: bool = False) -> Vectors:
-        """Vectors of the motion, in every lane where it has none; those `in_place` lie where `place` says for good."""
+        """Vectors of the motion, copied to all lanes if it has one lane; `in_place`: at offsets known in advance."""
         motion, alike = frame.view(self.motion.layout), self.motion.width == self.lanes
 
         def read(i):
@@ -59,7 +59,7 @@ class Directions:
         return self.numbers_of(frame, name, 1)[0]
 
     def inputs(self, frame: Frame, state: Vectors, t: Value, tangents: Vectors) -> list:
-        """The inputs of a program at a state, and their tangents: those of the state, and of the parameters."""
+        """The inputs of a program at a state, followed by the tangents of the state and of the parameters."""
         params = self.numbers_of(frame, "params", self.motion.numbers, in_place=True)
         of_params = [i - self.states - 1 for i in self.varied[self.states :]]
         moving: Any = [frame["dparams", i] for i in of_params]
@@ -70,7 +70,7 @@ class Directions:
     # ---- lanes ----
 
     def lane_of_motion(self, frame: Frame, lane: Value) -> Lane:
-        """The lane of the motion that a lane of tangents belongs to."""
+        """The lane of the motion to which a lane of tangents belongs."""
         return frame.view(self.motion.layout).lane(lane if self.motion.width == self.lanes else lane * 0)
 
     def lanes_of_tangents(self, frame: Frame, lane: Value) -> list[Lane]:
@@ -79,7 +79,7 @@ class Directions:
         return [tangents.lane(i) for i in ([lane] if alike else [integer(frame.code, j) for j in range(self.lanes)])]
 
     def place(self, frame: Frame, group: Value, index: Value) -> tuple[Value, Value]:
-        """The number of a lane's direction, counted over all members; and whether there is such a direction."""
+        """The number of the direction of a lane, counted over all members, and a flag: this direction exists."""
         member, directions = self.lane_of_motion(frame, index)["member"], frame.job("directions")
         direction = group if self.motion.width == self.lanes else group * self.lanes + index
         return member * directions + direction, (member >= 0) & (direction < directions)

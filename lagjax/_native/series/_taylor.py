@@ -1,9 +1,9 @@
-"""A motion as a power series: the functions that make its coefficients, and what is read off them along a step.
+"""`TaylorSeries`: the kernel functions that compute the Taylor coefficients of a motion, and values of the series.
 
     sums            Σ' aⱼ bₖ₋ⱼ for every Cauchy product, at order k
     coefficients    the series of q and q̇ to an order: the zeroth, then one after the other
 
-`_program._series` derives what they compute. All other parts of a kernel are built on a `TaylorSeries`.
+The formulas are derived in `_program._series`. All other parts of a kernel use a `TaylorSeries`.
 """
 
 import functools
@@ -27,18 +27,18 @@ AT_BORDER = "crossed", "crossed_number", "grazes"  # what is recorded of the bor
 
 
 def size_of_series(series: Series) -> int:
-    """The doubles of the series of one member, of its state and of the rows of its products."""
+    """The number of doubles in the series of one member: of its state and of the rows of Cauchy products."""
     return 2 * series.size * (MAX_ORDER + 1) + series.rows * MAX_ORDER
 
 
 class TaylorSeries:
-    """A module with the functions `sums` and `coefficients` of a motion, for others to be built on.
+    """An LLVM module with the functions `sums` and `coefficients` of a motion, the base of all kernels.
 
-    The program gives q̈ and whether the mass matrix is singular; n is the number of coordinates, `states` = 2n. `fields`
-    names what else a thread remembers (see `Memory`), `job` the structure that all threads share. `large` kernels are
-    written as tables (see `is_large`). Vectors have `width` lanes. The last of the numbers of the program are its
-    `pieces`, the others the `chosen` ones of a member, or all. Of its outputs this many are `kept`, behind the first
-    ones. With `keep_sums` the sums of every order stay in memory, not only those of the last.
+    The program gives q̈ and whether the mass matrix is singular; n is the number of coordinates, `states` = 2n.
+    `fields` are further fields of a thread's memory (see `Memory`), `job` the structure of shared arguments. `large`
+    kernels are tables (see `is_large`). Vectors have `width` lanes. The last parameters of the program are its
+    `pieces`, the rest the `chosen` ones of a member, or all. `kept` outputs after the first ones are stored. With
+    `keep_sums` the sums of every order stay in memory, not only those of the last.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class TaylorSeries:
         return Frame(self.module, self.layout, self.job, name, *kinds, **options)
 
     def finish(self) -> None:
-        """After all programs of the kernel."""
+        """Complete the module after its last program."""
         self.form.finish()
         self.look_up.finish()
 
@@ -97,7 +97,7 @@ class TaylorSeries:
     # ---- the sums ----
 
     def _sums_function(self) -> Code:
-        """`(k)`: Σ' aⱼ bₖ₋ⱼ for every product, 0 < j < k."""
+        """Emit `(k)`: the sum Σ' aⱼ bₖ₋ⱼ over 0 < j < k for every Cauchy product."""
         frame = self.function("sums", INTEGER)
         code, (k,) = frame.code, frame.arguments
         mixed = [pair for pair in self.series.cauchy_products if pair[0] != pair[1]]
@@ -117,7 +117,7 @@ class TaylorSeries:
         return frame.finish()
 
     def table(self, pairs, width: int | None = None) -> ir.GlobalVariable:
-        """The rows of each product, as distances in memory from the first row, of vectors of this width."""
+        """The rows of each product as a constant array of offsets from the first row, for vectors of this width."""
         flat = [row * MAX_ORDER * (width or self.width) for pair in pairs for row in pair]
         return integers(self.module, np.array(flat or [0], np.int64))
 
@@ -129,7 +129,7 @@ class TaylorSeries:
     # ---- the coefficients ----
 
     def _coefficients_function(self) -> Code:
-        """`(order)`: the series of the state, to that order, from its values."""
+        """Emit `(order)`: the series of the state up to that order, from its values."""
         frame = self.function("coefficients", INTEGER)
         code, (order,), series, n, form = frame.code, frame.arguments, self.series, self.n, self.form
         values = frame.vectors("values", series.values)
@@ -168,12 +168,12 @@ class TaylorSeries:
         return order - 1
 
     def state_inputs(self, frame: Frame) -> list[Vectors]:
-        """The inputs of the program at the present time: q, q̇, t, parameters."""
+        """The inputs of the program at the current state: q and q̇, t, parameters."""
         state = frame.vectors("y", self.states, lambda i: (i, 0))
         return [state, frame.vectors("t", 1), frame.vectors("params", self.numbers)]
 
     def recursion_inputs(self, frame: Frame, k: Value) -> list:
-        """The inputs of the order recursion: the coefficients of order k, k, 1/k, the values and the sums."""
+        """The inputs of the order recursion: the coefficients of order k, then k, 1/k, the values and the sums."""
         code, number, products = frame.code, frame.code.as_number(k), len(self.series.cauchy_products)
         time = code.select(code.compare("==", k, 1), number, 0.0)
         if self.keep_sums:
@@ -190,7 +190,7 @@ class TaylorSeries:
     # ---- along the step ----
 
     def increments(self, frame: Frame, order: Value, s: Value) -> tuple[Numbers, Numbers]:
-        """P(s) − y for every component, P′(s) for velocities, by Horner's scheme; a few at a time: none waits."""
+        """P(s) − y for every component of the state, P′(s) for velocities, by Horner's scheme."""
         code, increments, slopes = frame.code, self.form.room(frame, self.states), self.form.room(frame, self.n)
         s = code.lanes_of(s)
         for some, velocities in self.form.strands(code, self.n):
@@ -212,24 +212,24 @@ class TaylorSeries:
         return increments, slopes
 
     def evaluate_now(self, frame: Frame, line: StraightLine) -> Numbers:
-        """The outputs of a program of (q, q̇, t, parameters) at the present state."""
+        """The outputs of a line of (q, q̇, t, parameters) at the current state."""
         return self.form.run(frame, line, *self.state_inputs(frame))
 
     def move_state(self, frame: Frame, increments: Numbers) -> Numbers:
-        """The state at the end of these increments."""
+        """The state plus these increments."""
         moved = self.form.room(frame, self.states)
         for i in self.form.each(frame.code, self.states):
             moved[i] = frame["y", i] + increments[i]
         return moved
 
     def evaluate(self, frame: Frame, line: StraightLine, state: Numbers, s: Value) -> Numbers:
-        """The outputs of a program of (q, q̇, t, parameters) at a state, a time s after the present one."""
+        """The outputs of a line of (q, q̇, t, parameters) at a given state, at the time s after the current one."""
         return self.form.run(frame, line, state, [frame["t"] + s], frame.vectors("params", self.numbers))
 
     # ---- members and rounds ----
 
     def write_begin(self, start_next: Code, *more: Lines | Tables) -> None:
-        """`begin(job, memory, lanes)`: every lane takes a member; `more` forms prepare the memory, too."""
+        """Emit `begin(job, memory, lanes)`: each lane gets a member; `more` forms initialise their memory too."""
         frame = self.function("begin", public=True)
         for form in (*more, self.form):
             form.prepare(frame)
@@ -245,7 +245,7 @@ class TaylorSeries:
 
     @contextmanager
     def rounds(self, frame: Frame, count: Value) -> Iterator[None]:
-        """A context: its body is one round, of `count` at most, as long as a lane is active."""
+        """A context: its body is emitted as a loop of at most `count` rounds, while any lane is active."""
         with frame.code.repeat_while(lambda: self._any_active(frame), at_most=count):
             yield
 
@@ -257,7 +257,7 @@ class TaylorSeries:
 
 
 def is_large(program: Recurrent, projection=None, guards=None, times: int = 1, more: Sequence = ()) -> bool:
-    """True if a kernel that has the operations of these programs this many times, and of `more` lines, is in tables."""
+    """True if a kernel with these programs, `times` over, and with the lines `more`, is too long for straight code."""
     lines = [program.line]
     if projection is not None:
         lines += [projection.state.line, projection.velocity_scale.line]
@@ -268,7 +268,7 @@ def is_large(program: Recurrent, projection=None, guards=None, times: int = 1, m
 
 
 def order_for(rtol: float) -> int:
-    """The order whose series costs least: at the step that it allows, terms fall by e² each (Jorba & Zou, §3.2)."""
+    """The order of the cheapest series at this tolerance: its terms fall by a factor e² each (Jorba & Zou, §3.2)."""
     return min(MAX_ORDER, max(LEAST_ORDER, math.ceil(2 - math.log(rtol) / 2)))
 
 
@@ -281,7 +281,7 @@ def double(code: Code, x: float) -> Value:
 
 
 def mixed_sum(order: int, at, a, b) -> Value:
-    """Σ aⱼ bₖ₋ⱼ, in two strands that do not wait for each other."""
+    """The sum Σ aⱼ bₖ₋ⱼ at a constant order, in two independent partial sums."""
     strands = [at(a, j) * at(b, order - j) for j in range(1, min(3, order))]
     for j in range(3, order):
         strands[j % 2 == 0] = at(a, j) * at(b, order - j) + strands[j % 2 == 0]
@@ -289,7 +289,7 @@ def mixed_sum(order: int, at, a, b) -> Value:
 
 
 def square_sum(order: int, at, a) -> Value:
-    """Σ aⱼ aₖ₋ⱼ: every product but the middle one comes twice."""
+    """The sum Σ aⱼ aₖ₋ⱼ at a constant order, with each product computed once."""
     pairs = [at(a, j) * at(a, order - j) for j in range(1, (order + 1) // 2)]
     middle = [] if order % 2 else [at(a, order // 2) * at(a, order // 2)]
     if not pairs:

@@ -1,14 +1,14 @@
-"""Borders of a piecewise program: a step ends at the first one, and the next begins on the piece beyond.
+"""Borders in a kernel: a step ends at the first border, and the next one begins on the piece beyond.
 
-    decide    the pieces of a member that begins, and of one that has crossed a border on which others depend
-    stop      the first root of all guards along the step, by their series: there the step ends; and so it does at the
-              next of the `_knots`, and before one of the `_narrow_features` comes nearer than a series can tell
-    settle    a border counts only where the step was not shortened further
-    cross     the piece beyond (`_border_crossing`); its guard is zero there, and its slope tells whether the motion
-              stays; where L jumps, the velocities behind it (`_border_kicks`)
+    decide    the pieces of a member at its start, and of one that has crossed a border on which others depend
+    stop      the first root of all guards along the step, by their series, is its end, unless the next of the `_knots`
+              or the approach to one of the `_narrow_features` is sooner
+    settle    a border counts only if the step was not shortened further
+    cross     the piece beyond (`_border_crossing`), on whose border the motion is; the slope of its guard decides
+              whether it stays; where L jumps, the velocities behind the border (`_border_kicks`)
 
-What a piece is, and a guard, `_program._borders` says. That a border has been crossed is remembered (`_watch`), so that
-rounding does not decide on which side the next step begins.
+Pieces and guards are defined in `_program._borders`. A crossing is remembered (`_watch`), so that rounding does not
+decide on which side the next step begins.
 """
 
 from lagjax._native.code import _constants as limits
@@ -30,10 +30,10 @@ _AT_ONCE = 16.0  # roundings of the time by which two instants may differ that a
 
 
 class BorderControl:
-    """The borders of a motion, whose pieces are its last parameters.
+    """The kernel functions for the borders of a motion, whose pieces are its last parameters.
 
-    Where it `returns` to long steps (`_rank_drops`), it does not go back over a border, nor because of one. With
-    tangents (`nesting`) it has a `jump` of these.
+    If the motion `returns` to long steps (`_rank_drops`), it does not return across a border. With tangents (`nesting`)
+    a `jump` changes them.
     """
 
     def __init__(self, motion: TaylorSeries, borders: Borders, nesting: Nesting, returns: bool, jump: Jump | None):
@@ -99,7 +99,7 @@ class BorderControl:
             lane["stays", j], lane["params", j + self.motion.parameters] = 0.0, 0.0
 
     def _end_step_at_border(self) -> Code:
-        """`(order)`: the step ends at the first border."""
+        """Emit `(order)`: shorten the step so that it ends at the first border."""
         frame = self.motion.function("stop_at_border", INTEGER)
         code, (order,), h = frame.code, frame.arguments, frame["h"]
         degree = self.motion.followed_degree(code, order)
@@ -126,7 +126,7 @@ class BorderControl:
         return frame.finish()
 
     def _note_crossing(self, frame: Frame, border: Border, degree: Value, h: Value) -> None:
-        """Note where a guard is crossed, if that is sooner than what was noted before."""
+        """Record where a guard is crossed, if that is sooner than the crossing recorded before."""
         code, piece = frame.code, border.piece
         side, level, beyond = border.rule("side")(piece), border.level(piece), border.rule("beyond")(piece)
         is_share, undecided = border.has("on"), code.compare("==", side, 0.0)
@@ -150,9 +150,9 @@ class BorderControl:
             self._note_first_root(frame, border, h, (undecided, beyond, leads), comes, idle)
 
     def _limit_growth(self, frame: Frame, border: Border, level: Value) -> None:
-        """The step ends where the length of a cone's vector, whose polynomial is in `poly`, has grown by a part of it.
+        """End the step where a cone's vector, of length `poly`, has grown by a fraction of its length.
 
-        Tangents across it change at a rate that falls as it grows: from rest on without a bound.
+        Tangents across the vector change at a rate that is unbounded at rest and falls as the length grows.
         """
         length, rate = frame["poly", 0] + level, frame["poly", 1]
         part = limits.GROWTH_OF_LENGTH * length / rate
@@ -160,10 +160,10 @@ class BorderControl:
         frame.assign(sooner, nearest=part, crossed=Crossed.NOTHING)
 
     def _is_rounding(self, frame: Frame, border: Border, degree: Value) -> Value:
-        """True if a guard whose polynomial is in `poly` leaves a border that the motion touches by rounding alone.
+        """True if a guard, with polynomial `poly`, leaves a border that the motion touches by rounding alone.
 
-        Less than a fraction of atol does not count. Several active borders can be left and reached alternately
-        because of rounding. Each repetition therefore raises the threshold.
+        Less than a fraction of atol does not count. Several active borders can be left and reached alternately because
+        of rounding. Each repetition therefore raises the threshold.
         """
         code = frame.code
         turns = 1.0 + code.maximum(frame["idle_crossings"] - float(len(self.borders.guards)), frame.constant(0.0))
@@ -178,9 +178,9 @@ class BorderControl:
         return (nothing & touches) | (first[0] + first[1] + first[2] < limits.TINY)
 
     def _note_first_root(self, frame: Frame, border: Border, h: Value, piece: tuple, comes: Value, idle: Value) -> None:
-        """Note the root of a guard if it is the first: `beyond` it is that `piece`, or one that is `undecided`.
+        """Record the root of a guard if it is the first one, with the piece `beyond`, perhaps `undecided`.
 
-        A border that it `comes` to where another one has been met is met in a step of its own: each shifts tangents.
+        If `comes` holds, a border reached together with another one gets a step of its own, since each shifts tangents.
         """
         code, (undecided, beyond, leads) = frame.code, piece
         # At rest but for what it gains in so little time: u̇ is of the size of ü t.
@@ -202,9 +202,9 @@ class BorderControl:
         frame.assign(sooner, beyond=code.select(undecided, leads, beyond))
 
     def _join_crossings(self, frame: Frame, h: Value) -> None:
-        """Cross the first border of every group that is there at one instant with the first of all.
+        """In each group, cross the first border that is reached at the same instant as the first border of all.
 
-        With derivatives a border is met in a step of its own, which shifts tangents; it is crossed in no time.
+        With derivatives a border gets a step of its own, which shifts tangents, and may have length zero.
         """
         code, groups = frame.code, self.table.groups
         assert groups is not None
@@ -233,7 +233,7 @@ class BorderControl:
                 frame["more"] = frame["more"] + code.flag(at_once)
 
     def _refine_early_root(self, frame: Frame, degree: Value) -> None:
-        """Refine a root early in the step: its error is that of the part before it, not of the whole step."""
+        """Compute a root early in the step anew, on the part of the step before it, where the error is smaller."""
         code = frame.code
 
         def early():
@@ -246,7 +246,7 @@ class BorderControl:
             frame.call(self.roots.first_root, degree)
 
     def _note_levels(self, frame: Frame) -> None:
-        """The levels of guards that change: entries on both sides of the pieces of tables, and the speeds of cones."""
+        """Store the levels of guards that change: table entries on both sides of a piece, and speeds of cones."""
         code = frame.code
         for g, guard in enumerate(self.borders.guards):
             if self.borders.decisions[guard.piece].kind == CONE:
@@ -264,11 +264,11 @@ class BorderControl:
 
     @property
     def slides(self) -> bool:
-        """True if the motion may slide along a border that other switching numbers depend on."""
+        """True if the motion can slide along a border on which other switching numbers depend."""
         return bool(self.borders.holding.groups)
 
     def settle(self, frame: Frame) -> None:
-        """A step that has become shorter than planned does not reach its border."""
+        """Drop the border of a step that was shortened and does not reach it."""
         code = frame.code
         frame["crossed"] = code.select(reaches_border(frame), frame["crossed"], Crossed.NOTHING)
         frame["stepped"] = stepped = code.compare("!=", frame["h"], 0.0)
@@ -280,10 +280,10 @@ class BorderControl:
         frame.call(self.graze)
 
     def _find_grazing(self, base: int) -> Code:
-        """`()`: set `grazes` where the step ends at a border that it only grazes, and `stops` where to rounding.
+        """Emit `()`: set `grazes` where the step ends at a border that it only grazes, `stops` where u̇ is rounding.
 
-        With the rate u̇ of its switching number a motion that is moved by the tolerance, u by ε, does not cross it, or
-        has before, where u̇² ≤ 2 |ü| ε.
+        A perturbation of the motion by the tolerance, ε in the switching number u, decides whether it crosses the
+        border where u̇² ≤ 2 |ü| ε.
         """
         frame, motion, n = self.motion.function("graze"), self.motion, self.motion.n
         code, order, by = frame.code, frame.job("order"), [*range(base), *range(n, n + base)]
@@ -311,7 +311,7 @@ class BorderControl:
         return frame.finish()
 
     def _switching_rates(self, frame: Frame, order: Value) -> tuple[Value, Value]:
-        """u̇ and ü at the end of the step, of the switching number that is `hit`."""
+        """The rates u̇ and ü, at the end of the step, of the switching number selected by `hit`."""
         code, degree = frame.code, self.motion.followed_degree(frame.code, order)
         with code.loop(degree) as i:
             c = code.variable(frame.constant(0.0))

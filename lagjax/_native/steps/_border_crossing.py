@@ -1,4 +1,4 @@
-"""The crossing of borders, after a step that ends at one: the motion takes the piece beyond, slides, or is let go."""
+"""The crossing of borders after a step that ends at one: the motion enters the next piece, slides, or is released."""
 
 import functools
 from collections.abc import Container
@@ -19,9 +19,9 @@ _UNHELD = 1e6  # a share of a border that both sides do not push onto: those of 
 
 
 class BorderCrossing:
-    """The functions `cross`, and `decide`, which gives the pieces of lanes that are undecided.
+    """The kernel functions `cross`, and `decide`, which computes the pieces of undecided lanes.
 
-    With tangents (`nesting`) it has a `jump` of these. A motion that crosses has `forgotten` some fields.
+    With tangents (`nesting`) a `jump` changes them. The fields `forgotten` are reset in lanes that cross.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class BorderCrossing:
         self.cross = self._cross_borders()
 
     def _decide_pieces(self) -> Code:
-        """`()`: the pieces of the lanes that are undecided."""
+        """Emit `()`: compute the pieces of the lanes that are `undecided`."""
         frame = self.motion.function("decide")
         code, undecided = frame.code, frame["undecided"] > 0.0
         with code.only_if(code.any_lane(undecided)):
@@ -67,7 +67,7 @@ class BorderCrossing:
         frame.call(self.decide)
 
     def _cross_borders(self) -> Code:
-        """`()`: after the step, the pieces beyond the borders that were reached."""
+        """Emit `()`: after the step, set the pieces beyond the borders that it reached."""
         frame = self.motion.function("cross")
         code = frame.code
         stepped, crosses, was_cut = frame["stepped"] > 0.0, frame["crossed"] > Crossed.NOTHING, frame["nearest"] < 1.0
@@ -103,8 +103,8 @@ class BorderCrossing:
         return frame.finish()
 
     def _pass_borders(self, frame: Frame, going: Value) -> None:
-        """Go past borders and knots; the motion slides along no border that jumps there, and touches none such."""
-        shaken, code = self.borders.shaken, frame.code
+        """Cross borders and knots; a switching number that jumps there ends sliding and contact on its borders."""
+        shaken, code = self.borders.dependent_pieces, frame.code
         line = eliminate_dead_code(self.borders.program.line, [self.borders.decisions[j].switch for j in shaken])
         before = self.motion.evaluate_now(frame, line) if shaken else []
         before = [code.variable(before[k]) for k in range(len(shaken))]
@@ -129,7 +129,7 @@ class BorderCrossing:
                     frame.assign(where, self.motion.parameters + guard.slide, params=0.0)
 
     def _redecide_dependents(self, frame: Frame, going: Value) -> None:
-        """Decide the pieces anew that touch no border and have left none, where one is crossed that others read."""
+        """After a crossing, decide again the pieces that depend on others, unless they touch a border or left one."""
         if not self.borders.nested:
             return
         with frame.code.loop(self.motion.pieces) as j:
@@ -141,10 +141,11 @@ class BorderCrossing:
         self._redecide_piece(frame, going)
 
     def _enter_beyond(self, frame: Frame, border: Border) -> None:
-        """Take the piece beyond a border, which touches it; a piece that touches one is not decided anew.
+        """Enter the piece beyond a border, which it touches; a piece that touches one is not decided again.
 
-        A motion that would go back over the border at once is pushed onto it from both sides: it slides. So does one
-        that has come back in no measurable time, or not to rounding: it bounces off the border, ever less, and rests.
+        If the motion would return across the border at once, both sides push onto it, and it slides. So it does if it
+        has returned in no measurable time or by rounding: it bounces off the border in ever shorter time, and comes to
+        rest.
         """
         code, hit, again, beyond = frame.code, border.is_hit, frame["stepped"] <= 0.0, frame["beyond"]
         if self.table.groups:
@@ -170,10 +171,10 @@ class BorderCrossing:
         self._leave_sliding(frame, border, hit, again)
 
     def _leave_sliding(self, frame: Frame, border: Border, hit: Value, again: Value) -> None:
-        """Let a sliding motion continue on one side, when its share of that side reaches 0 or 1.
+        """End sliding on the side whose share of the acceleration has reached 1.
 
-        The rate of u that was kept at zero is zero there after a slide, and not where it did not slide at all. Where
-        both sides do not push onto the border, it continues as the function is written at the border itself.
+        The rate of u that was zero while sliding is zero there, unless the motion did not slide at all. If the sides do
+        not push onto the border, the piece at the border itself is taken.
         """
         code, on = frame.code, Border(frame, self.table, border["on"])
         with code.only_if(on.g >= 0):
@@ -192,7 +193,7 @@ class BorderCrossing:
                 on.remember(hit & on.is_cone, touch=Touch.NONE)
 
     def _release_cones(self, frame: Frame) -> None:
-        """Let the vectors of cones that hold no longer set out, with a speed that is twice what counts as none."""
+        """Give the vectors of released cones a speed in the direction of the force, twice that which counts as rest."""
         code, motion, n = frame.code, self.motion, len(self.borders.holding.release.outputs)
         shares = self.borders.releases
         hits = [self.table.crosses(frame, Crossed.GUARD, g) for g in shares]
@@ -209,7 +210,7 @@ class BorderCrossing:
                         frame.assign(hit, i + motion.n, low=0.0)
 
     def _redecide_kicked(self, frame: Frame, kicked: Value) -> None:
-        """Decide the pieces anew whose switching numbers depend on velocities, which have been kicked."""
+        """Decide again the pieces whose switching numbers depend on velocities, after a kick."""
         velocities = range(self.motion.n, self.motion.states)
         by_velocity = [
             j

@@ -1,4 +1,4 @@
-"""Kicks: the velocities of a motion behind a border at which L jumps (`_program._kick`)."""
+"""Kicks in a kernel: the velocities of a motion behind a border where L jumps (`_program._kick`)."""
 
 from lagjax._native.code import _constants as limits
 from lagjax._native.code._frame import Fields, Frame
@@ -12,7 +12,7 @@ _AT_END = 16.0  # roundings of the time by which the end of a motion may miss an
 
 
 class Kicks:
-    """The kicks of a motion of `base` coordinates, and of its tangents."""
+    """The kernel functions for kicks of a motion with `base` coordinates, and of its tangents."""
 
     def __init__(self, motion: TaylorSeries, borders: Borders, table: GuardTable, base: int):
         self.motion, self.borders, self.table = motion, borders, table
@@ -28,18 +28,18 @@ class Kicks:
         }
 
     def note_pieces(self, frame: Frame) -> None:
-        """Note the pieces before the border."""
+        """Store the pieces before the border."""
         with frame.code.loop(self.motion.pieces) as j:
             frame["kick_before", j] = self.table.piece(frame, j)
 
     def settle(self, frame: Frame, stepped: Value) -> Value:
-        """Note whether a step `counts`: also those of no length where a kick begins or ends them."""
+        """Set `counts` for steps that are recorded: also those of no length that end with a kick, and the last one."""
         stepped = stepped | (self.table.kicks(frame) & ~self._begins_past_jump(frame))
         frame["counts"] = stepped | (frame["last"] > 0.0)
         return stepped
 
     def _begins_past_jump(self, frame: Frame) -> Value:
-        """True where a motion begins at an instant at which L jumps: with the velocities behind it, in time's order."""
+        """The lanes that start at an instant where L jumps: they have the velocities behind it already."""
         begins = (frame["steps"] <= 0.0) & (frame["forward"] > 0.0)
         found = frame.constant(0.0) > 0.0
         for g, guard in enumerate(self.borders.guards):
@@ -51,7 +51,7 @@ class Kicks:
         return j in self.in_time and self.borders.decisions[j].kind == SIGN
 
     def look_at_end(self, frame: Frame, roots: Roots, degree: Value, h: Value) -> None:
-        """A step ends, to rounding, where L jumps at the end of the motion: with the velocities behind, in time."""
+        """End the last step with a kick where L jumps, to rounding, at the end time: final velocities are behind it."""
         code, one = frame.code, frame.constant(1.0)
         ends = (frame["last"] > 0.0) & (frame["forward"] > 0.0) & code.compare("!=", h, 0.0)
         for g, guard in enumerate(self.borders.guards):
@@ -67,7 +67,7 @@ class Kicks:
             frame.assign(there, crossed=Crossed.GUARD, crossed_number=float(g), beyond=beyond)
 
     def _kick_velocities(self, base: int) -> Code:
-        """`()`: the velocities behind the border, in the lanes that are to `kicks`; 2 there if they do not pass it."""
+        """Emit `()`: set the velocities behind the border in lanes with `kicks` = 1; 2 marks a reflection."""
         frame, motion, kick = self.motion.function("kick"), self.motion, self.borders.kick
         assert kick is not None
         code, n, kicks = frame.code, motion.n, frame["kicks"] > 0.0
@@ -88,7 +88,7 @@ class Kicks:
         return frame.finish()
 
     def apply(self, frame: Frame, crosses: Value) -> Value:
-        """Give the motion the velocities that it has where L jumps: behind the border, or before it once more.
+        """Apply the kick in lanes that cross a border where L jumps; those reflected stay before it.
 
         Returns the lanes with a kick.
         """

@@ -1,12 +1,12 @@
-"""The surfaces that a motion meets: the changes of sign of its guards along a step, on their own series.
+"""Events: the sign changes of guards along a step, by their own Taylor series.
 
-    begin_sides   which side of every surface a motion begins on
-    look          for every guard the roots of its polynomial, one after the other (`_roots`), each to the last digit of
-                  the guard itself; those in its direction end the motion, or are written down and the motion continues
+    begin_sides   the side of every surface on which a motion starts
+    look          for every guard the roots of its polynomial in order (`_roots`), each refined to the last digit of the
+                  guard itself; those in its direction end the motion, or are recorded while the motion continues
 
-A guard changes sign, too, where it jumps, at a border of its own: that is seen where the next step begins. A step ends
-where the series of a guard does not say what it does beyond. Where a guard has no series at all, as the square root of
-what is zero, the step is short, and its end is looked at.
+A guard also changes its sign where it jumps, at a border of its own: that is found at the start of the next step. A
+step ends where the series of a guard is not accurate beyond. Where a guard has no series, like the square root of zero,
+the step is short, and the guard is tested at its end.
 """
 
 from enum import IntEnum
@@ -24,7 +24,7 @@ from lagjax._program import inputs_below
 
 
 class Change(IntEnum):
-    """The sign of a guard's rate where it changes sign; 0 is none."""
+    """The direction of a sign change of a guard: it falls or rises; 0 means none."""
 
     FALLS = 1
     RISES = 2
@@ -34,7 +34,7 @@ MEMORY = ("side", "contact", "noted")  # of each guard from step to step
 
 
 class Events:
-    """The changes of sign of guards, the last of what the series of a motion follow: they end it, or are noted."""
+    """The kernel functions that find sign changes of guards, which are the last followed outputs."""
 
     def __init__(self, motion: TaylorSeries, step: StepControl, output: Output, roots: Roots, guards: Guards):
         self.motion, self.step, self.roots, self.guards = motion, step, roots, guards
@@ -77,7 +77,7 @@ class Events:
     # ---- the guards ----
 
     def _evaluate_guards(self) -> Code:
-        """`(order, s)`: the guards at that time after the present one, lane by lane, into `guard`."""
+        """Emit `(order, s)`: store the guards, at the time s after the current one in each lane, in `guard`."""
         frame = self.motion.function("guard", INTEGER, self.motion.vector)
         order, s = frame.arguments
         moved = self.motion.move_state(frame, self.motion.increments(frame, order, s)[0])
@@ -91,7 +91,7 @@ class Events:
         return watch.recall("guard")
 
     def _begin_sides(self) -> Code:
-        """`(order)`: for lanes at the start of a run, the side of each surface they are on, into `side`.
+        """Emit `(order)`: for lanes at the start of a run, the side of each surface they are on, into `side`.
 
         A guard that is zero to rounding takes its previous side: the remembered one, at least as large as the rounding
         of the guard before it came near zero, or else the one from which it can change in the direction of the guard.
@@ -118,7 +118,7 @@ class Events:
         return frame.finish()
 
     def _begin_side(self, watch: Watch, order: Value, fresh: Value) -> None:
-        """The side of a guard, whether it changes at the start, and its contact there."""
+        """Set, for lanes at their start (`fresh`), the side of a guard, whether it changes there, and its contact."""
         frame, code, g = watch.frame, watch.code, watch.g
         direction, is_rounded = watch.number("direction"), self.guards.is_rounded
         value, rate, size, rate_size = (frame["measured", g, k] for k in range(4))
@@ -155,12 +155,12 @@ class Events:
             watch.remember(fresh, zero=code.select(on_it, value, 0.0))
 
     def _noted_numbers(self, watch: Watch) -> tuple[Value, Value]:
-        """The two numbers of a guard that a motion `remembers`."""
+        """The two parameters of a guard that a motion `remembers` (see `Guards`)."""
         first = self.motion.parameters + watch.g - 2 * self.count
         return watch.frame["params", first], watch.frame["params", first + self.count]
 
     def _guard_noise(self, watch: Watch) -> Value:
-        """The rounding of a guard: that of now or, in a motion that remembers, the largest one so far."""
+        """The rounding error of a guard: the current one or, with `remembers`, the largest one so far."""
         noise = limits.GUARD_NOISE * watch.recall("kept")
         if not self.guards.remembers:
             return noise
@@ -168,9 +168,9 @@ class Events:
         return watch.code.select((noted > noise) & (noted < float("inf")), noted, noise)
 
     def _leading_term(self, watch: Watch, order: Value, noise: Value) -> tuple[Value, Value]:
-        """The first term of a guard behind its rate that is more than noise, and its order, for a whole step.
+        """The first Taylor term of a guard after its rate that exceeds `noise` over the step, and the order of it.
 
-        The order is one more than the last one where all terms are rounding, and 0 where there is no series.
+        The order is one more than the last one if all terms are noise, and 0 if there is no series.
         """
         frame, code, degree = watch.frame, watch.code, self.motion.followed_degree(watch.code, order)
         self.roots.polynomial(frame, watch.g + self.first, degree, frame["h"], frame.constant(1.0), 0.0)
@@ -193,7 +193,7 @@ class Events:
     # ---- a step ----
 
     def stop(self, frame: Frame, order: Value) -> None:
-        """Look along the step. It ends at the earliest change of all guards, or as far as these can be seen."""
+        """Search the step for changes of all guards; it ends at the earliest, or where a series is not accurate."""
         code, planned = frame.code, frame["h"]
         frame.call(self.begin_sides, order)
         frame.call(self.look, order)
@@ -215,7 +215,7 @@ class Events:
                 frame.call(self.step.projector.project)
 
     def _end_at_first(self, frame: Frame) -> None:
-        """The step ends at the earliest change, and the motion there; `change` tells of all at that instant."""
+        """End the step and the motion at the earliest change; `change` keeps all changes at that instant."""
         happens = frame["first_at"] < float("inf")
         for watch in self.table.each(frame):
             later = watch.recall("root_at") > frame["first_at"] + frame["smallest"]
@@ -224,7 +224,7 @@ class Events:
         frame.assign(happens, last=0.0, h=frame["first_at"] * frame["forward"])
 
     def _find_changes(self) -> Code:
-        """`(order)`: the changes of all guards along the step."""
+        """Emit `(order)`: search the step for the changes of all guards."""
         frame = self.motion.function("look_at_guards", INTEGER)
         frame["seen"], frame["first_at"] = 1.0, float("inf")
         for watch in self.table.each(frame):
@@ -248,7 +248,7 @@ class Events:
             self._search_roots(watch, order, degree, side, moving)
 
     def _has_no_root(self, watch: Watch, degree: Value) -> Value:
-        """The lanes whose polynomial has no root, as its coefficients alone tell; most often that is all."""
+        """The lanes whose polynomial has no root by a bound on its coefficients; this settles most cases."""
         frame, code, zero = watch.frame, watch.code, watch.frame.constant(0.0)
         falls, rises = code.variable(zero), code.variable(zero)
         with code.loop(degree + 1, start=1) as k:
@@ -291,15 +291,15 @@ class Events:
         watch.remember(moving, side_end=ahead.value)
 
     def _is_inaccurate(self, watch: Watch, last: Value, before: Value, size: Value) -> Value:
-        """The lanes whose last terms are large, or do not fall: the polynomial may leave out as much as they are.
+        """The lanes where the last terms are large, or do not fall, so that the truncation error may be as large.
 
-        Not where that is less than the rounding of the guard, as of one that leaves zero with a high power.
+        Terms below the rounding error of the guard are accepted, as of a guard that leaves zero with a high power.
         """
         is_long = (last > limits.GUARD_TERMS * size) | ((last > limits.FALL * before) & (last > limits.SEEN * size))
         return is_long & ~(last <= self._guard_noise(watch))
 
     def _follow_roots(self, watch: Watch, order: Value, degree: Value, ahead: Variable, where: Value) -> None:
-        """The roots of the polynomial, one after the other, as long as none ends the motion."""
+        """Process the roots of the polynomial in order, until one ends the motion."""
         frame, code = watch.frame, watch.code
         looking = code.variable(code.flag(where))
 
@@ -325,11 +325,11 @@ class Events:
         self._limit_sight(frame, searching(), frame["begin"] * frame["part"])
 
     def _limit_sight(self, frame: Frame, where: Value, seen: Value) -> None:
-        """Store, in some lanes, the fraction of the step up to which the polynomial of a guard can be trusted."""
+        """Lower, in some lanes, the fraction `seen` of the step up to which guards' polynomials are accurate."""
         frame.assign(where & (seen < frame["seen"]), seen=seen)
 
     def _ends_at_border(self, watch: Watch) -> Value:
-        """True if the next step decides what a guard does: this step ends at the guard's own border."""
+        """The lanes whose step ends at a border of the guard itself, so that the next step finds the change."""
         frame = watch.frame
         if not self.can_jump:
             return frame.constant(0.0) > 1.0
@@ -339,7 +339,7 @@ class Events:
         return (left <= 8.0 * frame["error"]) & at_border & (watch.number("piecewise") > 0.0)
 
     def _refine_root(self, watch: Watch, order: Value, where: Value, side: Value) -> Value:
-        """The time of a root, by Newton's steps on the guard itself; a root at 0 is where it has jumped."""
+        """The time of a root, by Newton steps on the guard itself; 0 for a jump of the guard."""
         frame, code, root = watch.frame, watch.code, watch.frame["root"]
         scale = frame["part"] * frame["h"]
         start, rate = root * scale, self.roots.whole_slope(frame) / scale
@@ -366,7 +366,7 @@ class Events:
         return code.select(lost, 0.0, at)  # time does not move
 
     def _take_changes(self, watch: Watch, order: Value, changes: Value, s: Value, ahead: Variable) -> Value:
-        """Changes at the times s: the event, or a note, where the direction is right; which lanes continue."""
+        """Handle changes at times s: end the motion or record them if the direction counts. The lanes that continue."""
         frame, code, side, size = watch.frame, watch.code, ahead.value, abs(s)
         counts = changes & ~(side * watch.number("direction") > 0.0)
         if self.guards.notes:
@@ -385,7 +385,7 @@ class Events:
         return goes_on
 
     def _bisect_change(self, watch: Watch, order: Value, ahead: Variable, where: Value) -> None:
-        """A part of the step, at whose end the guard is looked at; a change before that is found by bisection."""
+        """Test a guard without series at the end of a part of the step; find a change before it by bisection."""
         frame, code, side, h = watch.frame, watch.code, ahead.value, watch.frame["h"]
         with code.only_if(code.any_lane(where)):
             self._limit_sight(frame, where, frame.constant(limits.WITHOUT_SERIES))
@@ -401,7 +401,7 @@ class Events:
     # ---- what is noted ----
 
     def _write_change(self, output: Output) -> Code:
-        """`(order, g, s)`: write down a change of guard g and the state there, in the lanes that are due."""
+        """Emit `(order, g, s)`: record a change of guard g and the state there, in the lanes that are due."""
         frame = self.motion.function("note_change", INTEGER, INTEGER, self.motion.vector)
         code, (order, g, s) = frame.code, frame.arguments
         output.interpolate(frame, order, s)
@@ -419,7 +419,7 @@ class Events:
         return frame.finish()
 
     def write_end(self, frame: Frame, lane: Lane) -> None:
-        """Write how each guard changes at the end of a member; or, behind its notes, how many there were."""
+        """Write the change of each guard at the end of a member or, with `notes`, the number of its records."""
         with frame.code.loop(self.count) as g:
             if self.guards.notes:
                 row = self._note_row(frame, lane["member"], g, frame.job("room_of_notes"))

@@ -1,4 +1,4 @@
-"""Time knots: entries of tables over the time. The instant of the next one is known without a search."""
+"""Time knots: entries of tables over the time, at which a step ends; the next one is known without a search."""
 
 from lagjax._native.code import _constants as limits
 from lagjax._native.code._frame import Frame
@@ -9,13 +9,13 @@ from lagjax._program import Borders
 
 
 class Knots:
-    """The knots of a motion, and the entries of its other tables."""
+    """The kernel functions for the time knots of a motion, and for entries of its other tables."""
 
     def __init__(self, motion: TaylorSeries, borders: Borders, table: GuardTable):
         self.motion, self.borders, self.table = motion, borders, table
 
     def look(self, frame: Frame, h: Value) -> None:
-        """End the step at the first knot of all."""
+        """End the step at the first knot of all tables."""
         clocks = sorted(enumerate(self.borders.clocks), key=lambda clock: clock[1] not in self.borders.kicking)
         for c, j in clocks:
             self._end_at_knot(frame, c, j, h)
@@ -23,27 +23,27 @@ class Knots:
             self._note_coincidence(frame, h)
 
     def cross(self, frame: Frame, going: Value) -> None:
-        """Pass all knots that are at this instant."""
+        """Enter the next piece of every table that has a knot at this instant."""
         for j in self.borders.clocks:
             left, inside = self._time_to_knot(frame, j)
             passes = going & inside & (left <= self._instant_tolerance(frame))
             frame.assign(passes, self.motion.parameters + j, params=self.table.piece(frame, j) + frame["forward"])
 
     def entry(self, frame: Frame, j: int, index: Value) -> tuple[Value, Value]:
-        """An entry of the table of piece j, and whether there is one of this number."""
+        """Entry `index` of the table of piece j, and a flag: it exists."""
         located = self.borders.decisions[j].table
         assert located is not None
         inside = (index >= 0.0) & (index <= float(located.table.count - 1))
         return self.motion.look_up.take(frame, located.table, index), inside
 
     def _time_to_knot(self, frame: Frame, j: int) -> tuple[Value, Value]:
-        """The time to the next entry of the table that the time is on, and the lanes where there is one."""
+        """The time to the next knot of the table of piece j, and the lanes where there is one."""
         code, forward = frame.code, frame["forward"]
         knot, inside = self.entry(frame, j, self.table.piece(frame, j) + code.flag(forward > 0.0))
         return ((knot - frame["t"]) - frame["t_low"]) * forward, inside
 
     def _end_at_knot(self, frame: Frame, c: int, j: int, h: Value) -> None:
-        """End the step at the next entry of the table of piece j, which is clock number c."""
+        """End the step at the next knot of the table of piece j, which is clock number c."""
         code = frame.code
         left, inside = self._time_to_knot(frame, j)
         left, size = code.maximum(left, frame.constant(0.0)), abs(h)
@@ -60,7 +60,7 @@ class Knots:
         frame.assign(sooner, nearest=left / size, crossed=Crossed.KNOT, crossed_number=float(c))
 
     def _note_coincidence(self, frame: Frame, h: Value) -> None:
-        """Mark entries of several tables at one instant, where one of them can depend on parameters."""
+        """Mark knots of several tables at one instant, if one of them can depend on parameters."""
         code, end = frame.code, frame["nearest"] * abs(h)
         count, moves = frame.constant(0.0), frame.constant(0.0)
         for j in self.borders.clocks:
@@ -72,5 +72,5 @@ class Knots:
         frame.assign((count > 1.0) & (moves > 0.0), crossed=Crossed.KNOTS)
 
     def _instant_tolerance(self, frame: Frame) -> Value:
-        """The largest difference of two times that count as the same."""
+        """The largest difference of two times that count as equal."""
         return frame.code.maximum(abs(frame["t"]), frame["smallest"]) * (4.0 * limits.EPS)

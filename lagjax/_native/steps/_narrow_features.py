@@ -1,4 +1,4 @@
-"""Narrow features: a step ends before one comes nearer than a series of the motion can tell (`_program._features`)."""
+"""Narrow features (`_program._features`): a step ends before the series could miss one."""
 
 import itertools
 import math
@@ -13,7 +13,7 @@ from lagjax._program import BELOW, BESIDE, FALLS, GROWS, UP_TO, Feature
 
 
 class NarrowFeatures:
-    """The search for `features`, whose arguments are followed behind the switching numbers of the pieces."""
+    """The search for narrow `features`, whose arguments are followed after the switching numbers."""
 
     def __init__(self, motion: TaylorSeries, roots: Roots, features: tuple[Feature, ...]):
         self.motion, self.roots, self.features = motion, roots, features
@@ -29,7 +29,7 @@ class NarrowFeatures:
         frame["approach"] = frame["next_approach"]
 
     def _limit_step(self, frame: Frame, j: Value, feature: Feature, degree: Value, h: Value) -> None:
-        """The step ends where the argument of a feature, number j, has come as near as one step may bring it."""
+        """End the step where argument j of a feature has come as near as one step may bring it."""
         code = frame.code
         moves, last = self._argument_change(frame, j, degree, h)
         rise = code.lanes_of(code.as_double(degree)) * (limits.RISE / feature.scale)
@@ -45,7 +45,7 @@ class NarrowFeatures:
             self._find_feature(frame, j, feature, degree, h)
 
     def _argument_change(self, frame: Frame, j: Value, degree: Value, h: Value) -> tuple[Value, Value]:
-        """The largest change of a number along the step, Σ |cₖ| for k > 0, and the last of these terms."""
+        """A bound Σ |cₖ|, k > 0, of the change of argument j over the step, and the size of its last terms."""
         code, size, sum = frame.code, abs(h), frame.constant(0.0)
 
         def coefficient(k: Value) -> Value:
@@ -60,7 +60,7 @@ class NarrowFeatures:
         return sum.value, last.value
 
     def _find_feature(self, frame: Frame, j: Value, feature: Feature, degree: Value, h: Value) -> None:
-        """With its argument u: where α + β u is zero, the step ends; α + β u is `start` at its beginning."""
+        """End the step at the root of the level α + β u, u being argument j; `start` is its initial value."""
         code, kind, u = frame.code, feature.kind, self.motion.followed_value(frame, j)
         matters, slope, start, of_size, absolute = self._approach_level(frame, j, feature, degree, h)
         if kind in (BELOW, BESIDE):
@@ -115,7 +115,7 @@ class NarrowFeatures:
         return matters, slope, start, of_size, absolute
 
     def _approach(self, frame: Frame, kind: int, h: Value, matters: Value, root: Value) -> tuple[Value, Value]:
-        """Steps end ever nearer to where no series begins, until that is near; and then beyond it, where one does."""
+        """Shorten steps geometrically towards a point without series, then step over it if a series exists beyond."""
         code, found = frame.code, self.roots.is_found(frame)
         way, whole = frame["root"] * frame["part"], abs(h)
         nearby = (limits.NEARBY if kind == UP_TO else limits.NARROWEST) * code.maximum(whole, frame["approach"])

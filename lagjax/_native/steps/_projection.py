@@ -1,8 +1,8 @@
-"""The way back to the constraints, from the end of every step and from every output.
+"""The projection of the state onto the constraints, at the end of every step and at every output.
 
-A step by Taylor series leaves the constraints by its local error. The scene's own projection moves (q, q̇) back onto
-them; here it is a straight line like any other. It must not move the state much farther than the step may be wrong:
-then the projection has failed, and the step is halved.
+A Taylor step leaves the constraints by its local error. The projection of the scene, here a straight line like any
+other, moves (q, q̇) back onto them. If it moves the state much farther than the error tolerance, it has failed, and the
+step is halved.
 """
 
 from lagjax._native.code._constants import PROJECTION_TOLERANCES, ROUND_OFF, START
@@ -14,9 +14,9 @@ from lagjax._program import Recurrent
 
 
 class Projector:
-    """The projection of a motion, of whose n coordinates the first `base_size` are bound by constraints.
+    """The kernel functions of the projection; the first `base_size` of n coordinates satisfy the constraints.
 
-    The others are derivatives of them, which follow: how far they move says nothing about the step.
+    The rest are derivatives of them: how far they move does not count.
     """
 
     def __init__(self, motion: TaylorSeries, state: Recurrent, velocity_scale: Recurrent, base_size: int):
@@ -32,11 +32,11 @@ class Projector:
         }
 
     def scales(self, i: Index) -> bool:
-        """True if coordinate i may have a velocity scale; where i is not known, it may."""
+        """True if coordinate i may have a velocity scale, also if i is known at run time only."""
         return not isinstance(i, int) or i < self.base_size
 
     def project_state(self, frame: Frame, values: Numbers, increments: Numbers, s: Value) -> tuple[Numbers, Value]:
-        """The projection of a state of the series at t + s, and its distance in `PROJECTION_TOLERANCES`.
+        """The projection of a state `values` at t + s, and its distance in units of `PROJECTION_TOLERANCES`.
 
         The series ends within the tolerance of the constraints. If it is much farther to the state that the projection
         finds, that is not the state of this motion: near a configuration where constraints become dependent there are
@@ -55,7 +55,7 @@ class Projector:
         return projected, farthest.value
 
     def _project_end(self) -> Code:
-        """`()`: the end of the step back on the constraints, into `projected`; how far it was, into `defect`."""
+        """Emit `()`: store the projected end of the step in `projected`, and its distance in `defect`."""
         frame = self.motion.function("project")
         code, states, form, h = frame.code, self.motion.states, self.motion.form, frame["h"]
         sums = form.room(frame, states)
@@ -77,7 +77,7 @@ class Projector:
 
 
 def end_of_step(frame: Frame, i: Index) -> tuple[Value, Value]:
-    """Component i of the state at the end of the step, by the series, and what rounding takes from it."""
+    """Component i of the state at the end of the step, by the series, and its rounding error."""
     y = frame["y", i]
     increment = frame["increment", i] + frame["low", i]
     total = y + increment

@@ -1,7 +1,7 @@
-"""Steps next to a configuration where constraints become dependent.
+"""Steps near a configuration where constraints become dependent.
 
-Rounding allows no step there that is longer than the way to that configuration, so that steps become ever shorter and
-none gets through. The last long one is then taken once more, a little shorter.
+Because of rounding no step there is longer than the distance to that configuration, so that steps shrink and never pass
+it. Then the last long step is repeated, slightly shorter, to step over it.
 """
 
 from lagjax._native.code._constants import MOST_RETURNS, RETAKEN, RUNNING, SHORTER
@@ -12,7 +12,7 @@ from lagjax._native.steps._events import MEMORY
 
 
 def beginning(states: int, guards: int, borders: int) -> dict[str, int]:
-    """The sizes of the fields that a step begins with; of `guards` of events, and of those of `borders`."""
+    """The sizes of the fields that define the start of a step, for `guards` of events and guards of `borders`."""
     of_guards = dict.fromkeys(MEMORY, guards) | {"touch": borders}
     return dict.fromkeys(("y", "low"), states) | of_guards | dict.fromkeys(("t", "t_low", "steps"), 1)
 
@@ -30,7 +30,7 @@ AT_FIRST_ZERO = ("h_before", "returns", "returned")  # for every new member
 
 
 def retry_last_long_step(frame: Frame, form: Lines | Tables, begins: dict[str, int]) -> None:
-    """Return to where the last long step began, if steps have become too short since; or remember this beginning."""
+    """Return to the start of the last long step if steps have become too short since; else store this start."""
     code = frame.code
     size, long = (abs(frame[name]) for name in ("h", "h_before"))
     returns, steps = frame["returns"], frame["steps"]
@@ -54,7 +54,7 @@ def retry_last_long_step(frame: Frame, form: Lines | Tables, begins: dict[str, i
 
 
 def shorten(frame: Frame) -> None:
-    """Bound the next step of the lanes that have just returned."""
+    """Limit the next step of the lanes that have just returned."""
     code, returned = frame.code, frame["returned"] > 0.0
     size, returns = frame["h_before"], frame["returns"]
     for k in range(1, MOST_RETURNS + 1):

@@ -1,13 +1,13 @@
-"""The beginning of a step on the borders that the motion slides along: the retraction (`_program._sliding`).
+"""The retraction: the state is projected onto the borders along which the motion slides (`_program._sliding`).
 
-    apply    the state; its distance from them is rounding, which does not add up over steps
-    push     tangents of the state as it was; a member's start, too, may be varied off its borders
+    apply    the state; its distance from the borders is rounding, and does not accumulate over steps
+    push     tangents of the unprojected state; a varied start of a member may also lie off its borders
     pull     cotangents, the transpose of `push`
 
-Off a border by δu, on either side, the motion is back there at once: first derivatives of both sides agree, with those
-of the retraction, and so do second ones along two directions of which one stays on the border. Along two that leave it
-the sides differ, by the way that the motion takes to come back; and so do first derivatives where the motion begins at
-the limit of what holds it. There derivatives are NaN.
+From a displacement δu off a border, to either side, the motion returns at once: first derivatives from both sides agree
+with those of the retraction, and so do second ones along two directions of which one stays on the border. Along two
+that leave it they differ, by the path on which the motion returns; and so do first derivatives where the motion starts
+at the limit of the holding force. There derivatives are NaN.
 """
 
 import functools
@@ -25,7 +25,7 @@ Numbers = Callable[[Index], Value]
 
 
 class Retraction:
-    """The map onto the `borders` of a motion whose coordinates are those of a `nesting`."""
+    """The projection onto the `borders` of a motion whose coordinates are laid out by a `nesting`."""
 
     def __init__(self, motion: TaylorSeries, borders: Borders, nesting: Nesting):
         assert borders.holding.retraction is not None
@@ -51,7 +51,7 @@ class Retraction:
     # ---- the state ----
 
     def apply(self, is_run: bool) -> Code:
-        """`()`: the state. In a run what rounding took from it is gone, and tangents of tangents are the motion's."""
+        """Emit `()`: project the state. In a run, carried rounding errors are cleared, and tangents projected too."""
         motion, form = self.motion, self.motion.form
         frame = motion.function("retract")
         code = frame.code
@@ -79,9 +79,9 @@ class Retraction:
                 frame["y", i] = frame["unretracted", i]
 
     def note_start(self, frame: Frame) -> None:
-        """Note whether a step, whose series is known, is the first one of its member.
+        """Record whether a step, whose series is known, is the first one of its member.
 
-        And which coordinates are moved by a border that holds no more than it does: its share of a side is 0 or 1.
+        Record also which coordinates are moved by a border at the limit of its force: its share of a side is 0 or 1.
         """
         code, motion = frame.code, self.motion
         with code.loop(motion.width) as index:
@@ -101,7 +101,7 @@ class Retraction:
     # ---- derivatives over steps ----
 
     def push(self, directions: Directions, frame: Frame) -> None:
-        """The tangents of the state."""
+        """Compute the tangents of the projected state."""
         states, form, code = directions.states, directions.form, frame.code
         line = pushforward(self.line, self.dtypes, directions.varied, range(states))
         params = directions.numbers_of(frame, "params", self.motion.numbers)
@@ -131,7 +131,7 @@ class Retraction:
                     frame["dy", i, 0] = frame["end", i]
 
     def pull(self, cotangents: Cotangents) -> Code:
-        """`()`: the cotangents of the state, and of the parameters."""
+        """Emit `()`: the cotangents of the unprojected state, and of the parameters."""
         motion, form = self.motion, self.motion.form
         line, tables = pullback_and_entries(self.line, self.dtypes, cotangents.varied, range(motion.states))
         motion.layout.extend_by({"lost": motion.states})  # 1 for a number whose derivative does not exist
@@ -165,7 +165,7 @@ class Retraction:
         return frame.finish()
 
     def _find_lost(self, frame: Frame, begins: Value) -> None:
-        """Set `lost` to 1 for velocities that have a cotangent which a direction off a border would need."""
+        """Set `lost` to 1 for velocities whose cotangent would need a derivative along a direction off a border."""
         code, form = frame.code, self.motion.form
         moves_of = self._row_moves(code, form, [(lambda i: frame["unretracted", i], lambda i: frame["y", i])])
 
@@ -190,13 +190,13 @@ class Retraction:
     # ---- where there is no derivative ----
 
     def _state_place(self, row: int, i: Index, part: int) -> Index:
-        """The place of coordinate i of a row, or of its velocity (part 1), in a state."""
+        """The index in a state of coordinate i of a row, or (part 1) of its velocity."""
         return i + (part * self.motion.n + row * self.base)
 
     def _row_moves(self, code: Code, form, states: Sequence[tuple[Numbers, Numbers]]) -> Callable:
-        """`(row)`: whether a row moves by more than rounding, as its direction leaves a border; and `(i)`: what of it.
+        """A function of a row: a flag that its direction leaves a border by more than rounding, and `(i)`: its moves.
 
-        The first rows are those of the first pair of states, before and after, and so on.
+        The first rows are those of the first pair of states (before, after), and so on.
         """
 
         @functools.cache
@@ -219,7 +219,7 @@ class Retraction:
         return moves_of
 
     def _set_nan(self, frame: Frame, form, name: str, row: int, where: Value, which: Callable | None = None) -> None:
-        """NaN in a row of a field, for the coordinates `which` or all."""
+        """Set a row of a field to NaN in some lanes, for the coordinates `which` or all."""
         for i in form.each(frame.code, self.base):
             with frame.where(where if which is None else where & which(i)):
                 for part in range(2):

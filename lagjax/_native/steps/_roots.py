@@ -1,13 +1,11 @@
-"""Roots of a polynomial on [0, 1], lane by lane: no sampling, so that none is stepped over.
+"""Roots of a polynomial P on [0, 1], in each lane; by bounds instead of samples, so that no root is missed.
 
-With M ≥ |P″| on the whole interval, P(x + d) ≥ P(x) + P′(x) d − M d²/2: as long as the right side is positive there is
-no root. From where it begins, x moves to where it vanishes. That converges to the first root, at a simple one
-quadratically; past a touch, where P is zero to rounding and does not fall for certain, it hops, by less than what P
-could do unseen.
+With M ≥ |P″| on the whole interval, P(x + d) ≥ P(x) + P′(x) d − M d²/2: while the right side is positive there is no
+root. From x the search moves to where it vanishes. That converges to the first root, quadratically to a simple one;
+past a point where P touches zero to rounding, it moves by less than what P could do within rounding.
 
-What a series leaves out is not rounding, but it is known: about as much as its last terms, times the power that follows
-them. Where P comes so near to zero without going through, that cannot be decided from here: the search ends
-there, and a step that ends there, too, has a series that knows.
+The truncation error of the series is estimated by its last terms, times the power after them. If P comes so near to
+zero without changing its sign, the search ends there, because a step that ends there has a series that decides.
 """
 
 import math
@@ -20,10 +18,10 @@ from lagjax._native.series._taylor import TaylorSeries, integer
 
 
 class Roots:
-    """Functions of the polynomial in `poly`, of which `degree + 1` coefficients are there.
+    """Kernel functions for the polynomial `poly`, with `degree + 1` coefficients.
 
-    `first_root(degree)` finds the first root. P is known to the rounding of its largest value; where P(0) is negative
-    beyond that the root is 0. `next_root(degree)` begins at `begin`, where P may be zero, with the sums of `sum_up`.
+    `first_root(degree)` finds the first root. P is known to the rounding of its largest value; if P(0) is more negative
+    than that, the root is 0. `next_root(degree)` begins at `begin`, where P may be zero; it needs `sum_up`.
     """
 
     def __init__(self, motion: TaylorSeries):
@@ -55,7 +53,7 @@ class Roots:
     # ---- a number along the step as a polynomial ----
 
     def polynomial(self, frame: Frame, j: Value, degree: Value, h: Value, side: Value, level: "Value | float") -> None:
-        """σ (u − level) over the step as a polynomial on [0, 1], into `poly`, of what is followed as number j."""
+        """Store σ (u − level) over the step, u being followed number j, as a polynomial on [0, 1] in `poly`."""
         code, motion = frame.code, self.motion
         frame["poly", 0] = side * (motion.followed_value(frame, j) - level)
         power = code.variable(side * h)
@@ -65,19 +63,19 @@ class Roots:
         frame["poly", degree + 1] = 0.0
 
     def size(self, frame: Frame, degree: Value) -> Value:
-        """Σ |cₖ|."""
+        """The sum Σ |cₖ| of the coefficients, a bound of |P|."""
         code, size = frame.code, frame.code.variable(frame.constant(0.0))
         with code.loop(degree + 1) as k:
             size.value += abs(frame["poly", k])
         return size.value
 
     def last_terms(self, frame: Frame, degree: Value, first: int = 0) -> Value:
-        """The size of the last three, or of those before: one may have been divided away, one be zero by symmetry."""
+        """The sum of three |cₖ|, the last ones or those `first` before: single ones may be zero by symmetry."""
         last = [abs(frame["poly", degree - (first + k)]) for k in range(3)]
         return last[0] + last[1] + last[2]
 
     def shorten(self, frame: Frame, degree: Value, is_long: Callable[[], Value]) -> None:
-        """Halve the interval as long as it is said to be long; `part` of it is left."""
+        """Halve the interval while `is_long()`; `part` is the fraction that is left."""
         code = frame.code
         frame["part"] = 1.0
         again = code.variable(integer(code, 1))
@@ -89,7 +87,7 @@ class Roots:
                 self.stretch(frame, degree, code.select(long, 0.5, 1.0))
 
     def shorten_to(self, frame: Frame, degree: Value, rtol: Value, atol: Value, share: float = math.inf) -> None:
-        """Halve the interval until the last terms are below atol, or a `share` of Σ |cₖ|, + rtol Σ |cₖ|."""
+        """Halve the interval until the last terms are below rtol Σ |cₖ| + atol, or + `share` Σ |cₖ| if less."""
 
         def is_long():
             size, least = self.size(frame, degree), frame.code.lanes_of(atol)
@@ -100,7 +98,7 @@ class Roots:
         self.shorten(frame, degree, is_long)
 
     def stretch(self, frame: Frame, degree: Value, part: "Value | float", times: "Value | float" = 1.0) -> None:
-        """The polynomial over a part of its interval, `times` as large."""
+        """Rescale the polynomial to a fraction `part` of its interval, and multiply it by `times`."""
         code = frame.code
         frame["part"] = frame["part"] * part
         power = code.variable(code.lanes_of(times))
@@ -109,7 +107,7 @@ class Roots:
             power.value = power.value * part
 
     def divide(self, frame: Frame, degree: Value, powers: Value) -> None:
-        """Divide by `powers` powers of s, for a zero at 0 that is no root to be found, and by all that vanish next."""
+        """Divide P by s once per root at 0 that is not searched, and by further powers while P(0) vanishes."""
         code, left = frame.code, frame.code.variable(powers)
         frame["divided"] = 0.0
         with code.repeat_while(lambda: code.any_lane(left.value > 0.0), at_most=MAX_ORDER):
@@ -121,7 +119,7 @@ class Roots:
             left.value = code.select(vanishes, code.maximum(left.value - 1.0, 1.0), left.value - 1.0)
 
     def leading_sign(self, frame: Frame, degree: Value) -> Value:
-        """The sign of the first coefficient behind c₀ that is not zero; 0 without any."""
+        """The sign of the first nonzero coefficient after c₀; 0 without any."""
         code, sign = frame.code, frame.code.variable(frame.constant(0.0))
         with code.loop(degree) as i:
             c = frame["poly", degree - i]
@@ -129,7 +127,7 @@ class Roots:
         return sign.value
 
     def whole_slope(self, frame: Frame) -> Value:
-        """The slope at the root of what P was before it was divided."""
+        """The slope, at the root, of P before the division by powers of s."""
         code, slope, left = frame.code, *(frame.code.variable(frame[name]) for name in ("slope", "divided"))
         with code.repeat_while(lambda: code.any_lane(left.value > 0.0), at_most=MAX_ORDER):
             slope.value = code.select(left.value > 0.0, slope.value * frame["root"], slope.value)
@@ -142,7 +140,7 @@ class Roots:
         return (frame["is_root"] > 0.0) & (frame["root"] < 1.0)
 
     def place(self, frame: Frame, otherwise: float) -> Value:
-        """The root, or else the end of the search, as a fraction of the step; `otherwise` if that was all of it."""
+        """The root, or the end of the search, as a fraction of the step; `otherwise` if all of it was searched."""
         code, root, part = frame.code, frame["root"], frame["part"]
         return code.select(root < 1.0, root * part, code.select(part < 1.0, part, otherwise))
 
@@ -165,7 +163,7 @@ class Roots:
         return frame.finish()
 
     def sum_up(self, frame: Frame, degree: Value) -> None:
-        """The largest falls and rises of P, and its largest bends down and up: for `next_root`."""
+        """Store bounds of the fall and the rise of P, and of −P″ and P″, for `next_root`."""
         code, zero = frame.code, frame.constant(0.0)
         falls, rises, down, up = (code.variable(zero) for _ in range(4))
         with code.loop(degree + 1, start=1) as k:
@@ -197,7 +195,7 @@ class Roots:
         return frame.finish()
 
     def _march_to_root(self, frame: Frame, degree: Value, searching: Value) -> None:
-        """March to the first root from `begin` on, by the bounds `down` of −P″ and `up` of P″."""
+        """Search for the first root from `begin` on, with bounds `down` of −P″ and `up` of P″."""
         code, down = frame.code, frame["down"]
         bend = code.maximum(down, frame["up"])
         at_start = (ROOT_NOISE * EPS) * abs(frame["poly", 0]) + frame["unsure"]
@@ -232,7 +230,7 @@ class Roots:
         frame.assign(active(), is_root=0.0, root=x.value)
 
     def _note_root(self, frame: Frame, here: Value, known: tuple[Value, ...], is_root: Value, ends: Value) -> None:
-        """The place of a root, or where the search ends; near it one step of Newton's more, and not a long one."""
+        """Store a root, or the end of the search; a root is improved by one bounded Newton step."""
         code, (value, slope, error, bend) = frame.code, known
         hop, back = self._rounding_distance(frame, error, bend), value / slope
         back = code.select((slope < 0.0) & (here > frame["begin"]), code.select(back < hop, back, hop), 0.0)
@@ -240,12 +238,12 @@ class Roots:
         frame.assign(ends, root=place, is_root=is_root, slope=slope, error=error)
 
     def _rounding_distance(self, frame: Frame, error: Value, bend: Value) -> Value:
-        """The distance on which P, from zero, cannot exceed its error by its bend alone."""
+        """The distance from a zero within which P cannot exceed its error, given a bound of P″."""
         code = frame.code
         return code.maximum(code.intrinsic("sqrt", 2.0 * error / bend), frame["instant"])
 
     def _eighth_power(self, x: Value) -> Value:
-        """x⁸, which bounds the power after the last one of any order."""
+        """The power x⁸, a bound of the power after the last one at any order."""
         square = x * x
         return (square * square) * (square * square)
 

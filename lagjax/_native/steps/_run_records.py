@@ -1,4 +1,4 @@
-"""The records of a run: the states at the output times, the steps for a transpose, and how each member ended."""
+"""The records of a run: states at the output times, the steps for the adjoint, and how each member ended."""
 
 from lagjax._native.code._constants import DONE, EPS
 from lagjax._native.code._frame import Fields, Frame, Index, Lane
@@ -12,19 +12,19 @@ NUMBER = 3  # the place of that; when steps are in order a tangent writes there 
 
 
 def instant_about(code: Code, t: Value) -> Value:
-    """The largest difference of a time from `t` that counts as none."""
+    """The largest difference from time `t` that counts as zero."""
     return _INSTANT * abs(t)
 
 
 class Output:
-    """Writes into the arrays of the job."""
+    """The kernel functions that write into the arrays of the job."""
 
     def __init__(self, motion: TaylorSeries, projector: Projector | None):
         self.motion, self.projector = motion, projector
 
     @staticmethod
     def fields(n: int) -> Fields:
-        """The fields of a thread's memory; times are in the direction of time."""
+        """The fields of a thread's memory for outputs; times are measured in the direction of the motion."""
         return {
             "between": 2 * n,  # the state at an output time
             "due": 1,  # the next output time
@@ -35,11 +35,11 @@ class Output:
     # ---- states at output times ----
 
     def place(self, frame: Frame, member: Value, time_index: Index, i: Index) -> Value:
-        """The place in `path` of component i of the state at an output time."""
+        """The index in `path` of component i of the state at an output time of a member."""
         return (member * frame.job("times") + time_index) * self.motion.states + i
 
     def await_next(self, frame: Frame, lane: Lane, index: Value) -> None:
-        """`due` is the next output time before the end, in the direction of time; infinite after the last one."""
+        """Set `due` to the next output time before the end, in the direction of the motion; infinite after the last."""
         code = frame.code
         lane["output"] = index
         inside = index < frame.job("times") - 1
@@ -47,9 +47,9 @@ class Output:
         lane["due"] = code.select(inside, time, float("inf"))
 
     def write_due(self, frame: Frame, order: Value, after: Value, kicks: Value | None) -> None:
-        """The states at the output times before `after`, the end of the step, one of every lane at a time.
+        """Write the states at all output times before `after`, the end of the step.
 
-        One at the very end belongs to the next step where `kicks` says that this begins with other velocities.
+        An output at the end itself is left to the next step where a kick (`kicks`) changes the velocities.
         """
         code, moving = frame.code, frame.code.compare("!=", frame["h"], 0.0)
         forward, t, low = frame["forward"], frame["t"], frame["t_low"]
@@ -75,7 +75,7 @@ class Output:
                     self.await_next(frame, lane, index + 1)
 
     def interpolate(self, frame: Frame, order: Value, s: Value) -> None:
-        """The state a time s after the present one: that of the series, on the constraints if that is near."""
+        """Store in `between` the state at time s after the current one, projected if that is near."""
         states, form = self.motion.states, self.motion.form
         increments, _ = self.motion.increments(frame, order, s)
         values = form.room(frame, states)
@@ -92,10 +92,10 @@ class Output:
     # ---- steps, for their transposes ----
 
     def record(self, frame: Frame, lane: Lane, kicks: bool, state: str = "y") -> None:
-        """Time, size and first state of the step, a field, whose it is and which, as long as there is room.
+        """Append a step to the record: time, size, start `state`, member and number, while there is room.
 
-        All threads write rows into one table, in the order in which they come to it. Where anything `kicks` the motion,
-        steps of no length may count, too.
+        All threads append to one table, in order of arrival. Where anything `kicks` the motion, steps of zero length
+        may count.
         """
         code, member = frame.code, lane["member"]
         with code.only_if((member >= 0) & (lane["counts"] > 0.0 if kicks else code.compare("!=", lane["h"], 0.0))):
@@ -111,7 +111,7 @@ class Output:
                     self._record_pieces(frame, lane, row + (RECORDED + motion.states))
 
     def _record_pieces(self, frame: Frame, lane: Lane, row: Value) -> None:
-        """The pieces of the step, and what it ends at (`AT_BORDER`)."""
+        """Write the pieces of the step, and the border at which it ends (`AT_BORDER`)."""
         pieces = self.motion.pieces
         with frame.code.loop(pieces) as j:
             frame.write("record", row + j, lane["params", j + self.motion.parameters])
@@ -121,7 +121,7 @@ class Output:
     # ---- the end of a member ----
 
     def write_end(self, frame: Frame, lane: Lane, states: bool) -> None:
-        """Write the end of a member, its code and its steps; the end is its last output too, if there are `states`."""
+        """Write the end time of a member, its code and step counts; with `states` its last state and output."""
         code, member = frame.code, lane["member"]
         frame.write("t_end", member, lane["t"])
         for name in ("code", "steps", "rejected"):

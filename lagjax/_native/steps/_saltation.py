@@ -1,9 +1,9 @@
-"""Derivatives at a border: the jump of tangents, and of cotangents, to every order (`_program._jump`).
+"""Derivatives at a border in a kernel: the jump of tangents and cotangents, to every order (`_program._jump`).
 
-The border is crossed at another time when the motion is varied; up to then the acceleration is a⁻, and from then on a⁺.
-First tangents of a velocity jump by (a⁻ − a⁺) δt where the acceleration jumps, tangents of tangents also where only its
-derivative does. Where the border is grazed, so that a change of the state within the tolerance decides whether it is
-crossed, none of this exists: derivatives are NaN there, but for first ones where the acceleration is continuous.
+A varied motion crosses the border at another time; until then its acceleration is a⁻, from then on a⁺. First tangents
+of a velocity jump by (a⁻ − a⁺) δt, and tangents of tangents also where only the derivative of the acceleration jumps.
+Where the border is grazed, so that a change of the state within the tolerance decides whether it is crossed,
+derivatives do not exist and are NaN, except first ones where the acceleration is continuous.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,7 +19,7 @@ from lagjax._program import Borders, Jump, Table
 
 
 class Saltation:
-    """The jumps of a motion with tangents, whose first `base` coordinates are the motion alone."""
+    """The kernel functions for the jumps of a motion with tangents; its first `base` coordinates are the motion."""
 
     def __init__(self, motion: TaylorSeries, table: GuardTable, base: int, jump: Jump):
         self.motion, self.base, self.pieces, self.jump = motion, base, motion.pieces, jump
@@ -46,11 +46,11 @@ class Saltation:
     def _find_jumping_tangents(
         self, frame: Frame, form, hit: Vectors, pieces: Numbers, before: Numbers, behind: Numbers, grazes: Value
     ) -> tuple[Callable, Value]:
-        """`(i, part)`: true if the first tangents of coordinate i (part 0), or of its velocity, jump at what is `hit`.
+        """A function `(i, part)`: first tangents of coordinate i (part 0) or its velocity jump at `hit`; and `lost`.
 
-        Both do where L jumps, those of a velocity where its acceleration does by more than rounding. Then, where a cone
-        is left: from there tangents across it follow its direction at a rate without a bound, they are not known.
-        At a border that is grazed, as by what begins to move there, that of one coordinate may be rounding of others.
+        Both jump where L jumps, those of a velocity where its acceleration jumps by more than rounding. `lost`: a cone
+        is left, and tangents across its vector follow its direction at an unbounded rate. At a grazed border the jump
+        of one coordinate may be the rounding of others.
         """
         code, guards = frame.code, self.table.borders.guards
         kicks = lost = frame.constant(0.0) > 0.0
@@ -75,7 +75,7 @@ class Saltation:
         return jumps, lost
 
     def _row_places(self, frame: Frame, form, rows: range) -> Iterator[tuple[int, Index, int, Index]]:
-        """Row, coordinate, part (1 for its velocity) and place in the state of all numbers of some rows."""
+        """Row, coordinate, part (1 for its velocity) and index in the state of all numbers of some rows."""
         for row in rows:
             for part in range(2):
                 for i in form.each(frame.code, self.base):
@@ -84,7 +84,7 @@ class Saltation:
     def _tangent_jumps(
         self, frame: Frame, form, out: Numbers, hit: Vectors, pieces: Numbers, is_hit: Value, grazes: Value
     ) -> Callable:
-        """`(row, i, part)`: the number that is added to coordinate i of a row (part 0), or to its velocity (part 1)."""
+        """A function `(row, i, part)`: the jump of the tangent of coordinate i (part 0) or its velocity (part 1)."""
         code, n, first = frame.code, self.base, (len(self.jump.orders) - 1) * 2 * self.base
         before, behind = (_select_numbers(out, first + k * n, n) for k in range(2))
         jumps, lost = self._find_jumping_tangents(frame, form, hit, pieces, before, behind, grazes)
@@ -99,7 +99,7 @@ class Saltation:
         return added
 
     def _jump_or_nan(self, code: Code, hit: Value, grazes: Value) -> Callable[[Value], Value]:
-        """`(jump)`: the jump, or NaN where there is none: at a border that is grazed, and where knots coincide."""
+        """A function of a jump: the jump, or NaN where it does not exist (grazed border, coincident knots)."""
         several = hit > float(Hit.BORDER)
 
         def jump_or_nan(jump: Value) -> Value:
@@ -110,7 +110,7 @@ class Saltation:
     # ---- in a run: the motion with its tangents ----
 
     def note(self) -> Code:
-        """`()`: the state at the border that a step ends at. Several may be crossed there, one after the other."""
+        """Emit `()`: store the state at the border where a step ends; several may be crossed there in turn."""
         frame = self.motion.function("note_before")
         stepped = self.table.counts(frame)
         for i in self.motion.form.each(frame.code, self.motion.states):
@@ -118,7 +118,7 @@ class Saltation:
         return frame.finish()
 
     def apply(self) -> Code:
-        """`()`: the tangents beyond the border that is `hit`, on the pieces behind all that are crossed there."""
+        """Emit `()`: compute the tangents beyond the border that is `hit`, with the pieces after all crossings."""
         frame = self.motion.function("jump_of_tangents")
         motion, code, n, base = self.motion, frame.code, self.motion.n, self.base
         is_hit = frame["is_hit"] > 0.0
@@ -154,7 +154,7 @@ class Saltation:
         frame["edge_t"], frame["edge_grazes"] = frame["t"] + frame["h"], frame["grazes"]
 
     def note_end(self) -> Code:
-        """`()`: note the state at the border that a step ends at, for tangents at the beginning of the next one."""
+        """Emit `()`: store the state at the border where a step ends, for tangents at the start of the next one."""
         frame = self.motion.function("note_end")
         frame["is_hit"] = Hit.NONE
         with frame.code.only_if(frame.code.any_lane(self.table.crosses_any(frame))):
@@ -162,18 +162,18 @@ class Saltation:
         return frame.finish()
 
     def _switching_choice(self, numbers: Callable) -> list:
-        """The numbers that choose the switching number, as inputs of the jump."""
+        """The inputs of the jump that select the switching number: weights, and entries of levels that vary."""
         return [numbers("hit", self.pieces), *([numbers("entry", self.pieces)] if self.chosen > self.pieces else [])]
 
     def _edge_inputs(self, numbers: Callable, behind: Vectors) -> list:
-        """The inputs of the jump but for its upper rows; `numbers(name, count)` gives vectors of the motion."""
+        """The inputs of the jump except its upper rows; `numbers(name, count)` reads vectors of the motion."""
         return [
             numbers("edge", self.motion.states), numbers("edge_t", 1), numbers("params", self.motion.parameters),
             numbers("pieces_before", self.pieces), behind, *self._switching_choice(numbers),
         ]  # fmt: skip
 
     def push(self, directions: Directions, frame: Frame) -> None:
-        """The tangents behind a border, at the beginning of the step from there."""
+        """Compute the tangents behind a border, at the start of the next step."""
         form, n, jump, code = directions.form, directions.n, self.jump, frame.code
 
         def numbers(name, count, first=0):
@@ -190,7 +190,7 @@ class Saltation:
                 frame["dy", place, 0] = frame["dy", place, 0] + added(jump.lower + row, i, part)
 
     def pull(self, cotangents: Cotangents) -> Code:
-        """`()`: from the state beyond the border that a step ends at to that before it, and to the parameters."""
+        """Emit `()`: cotangents of the state before a border, and of parameters, from those of the state beyond."""
         motion, frame = self.motion, self.motion.function("back_border")
         code = frame.code
         frame["crossed"] = code.select(frame["has_after"] > 0.0, frame["crossed"], Crossed.NOTHING)
@@ -206,7 +206,7 @@ class Saltation:
         return frame.finish()
 
     def note_after(self) -> Code:
-        """`()`: note the pieces of a step, for cotangents at the end of the one before."""
+        """Emit `()`: store the pieces of a step, for cotangents at the end of the step before it."""
         frame = self.motion.function("note_after")
         with frame.code.loop(self.motion.pieces) as j:
             frame["pieces_after", j] = frame["params", j + self.motion.parameters]
@@ -214,9 +214,10 @@ class Saltation:
         return frame.finish()
 
     def _cotangent_jumps(self, frame: Frame, behind: Vectors) -> tuple[Callable, tuple[Table, ...], list[Value]]:
-        """`(row, i)`: the gain of the cotangent of number i of a row, q, q̇ and then the parameters, at the `edge`.
+        """A function `(row, i)`: the jump of the cotangent of number i of a row (q, q̇, parameters) at the `edge`.
 
-        Of `state_ct`, with the pieces `behind` the border. And tables, with the numbers of entries and their gains.
+        It is for `state_ct`, with the pieces `behind` the border. Also the tables, with entry indices and their
+        cotangents.
         """
         n, rows, motion, code = self.base, self.jump.lower, self.motion, frame.code
         inputs = self._edge_inputs(lambda name, count: frame.vectors(name, count), behind)

@@ -1,23 +1,22 @@
-"""Step control: how long a step may be, whether its series keeps what it promises, and the step itself.
+"""Step control: the size of a step, the check of its series, and the update of the state.
 
 With the scaled norm ‖c‖ = max |cᵢ| / (a + rtol·sᵢ), sᵢ the size of component i over the step,
 
     h = 0.9 min(‖yₚ‖^(−1/p), ‖yₚ₋₁‖^(−1/(p−1)))
 
 makes the last terms of the series as small as the tolerance. Source: Jorba & Zou, Exp. Math. 14 (2005) §3.2. The check
-is ours: the scaled defect of the polynomial P, d = P″ − q̈(P, P′) at the middle and at the end of the step, must obey
-h ‖d‖ / (p+1) ≤ 1. It costs two accelerations, and sees what no coefficient shows: a border of a piecewise function, a
+is ours: the scaled defect of the polynomial P, d = P″ − q̈(P, P′) at the middle and at the end of the step, must obey h
+‖d‖ / (p+1) ≤ 1. It costs two accelerations, and detects what no coefficient shows: a border of a piecewise function, a
 narrow feature ahead.
 
-The floor a is atol where it was given. By default (an atol of 0) it is rtol·min(1/1000, S/16), S the largest
-coordinate, or velocity, that the motion has had: a motion of 1e-10 metres is followed as the same one in ångströms is.
-A velocity moves a coordinate by h times as much, so that S of the velocities is no less than S of the coordinates over
-the longest step so far: a motion at rest has velocities that are rounding. Where a motion begins S is what its series
-promises, the largest of its terms over a step that holds in proportion to it: what rests at 1e-50 is as large as it
-will be a step away. If such a motion is refused its steps as often as not, what was promised is rounding, and S is
-infinite, as it is where a motion starts at rest at q = 0, of which nothing tells a size. Of the alternatives, a floor
-for every component would follow rounding where a component is zero by symmetry, and one for every array of the user
-would not be the same for coordinates of two arrays as of one.
+The floor a is atol if that is given. By default (atol = 0) it is rtol·min(1/1000, S/16), where S is the largest
+coordinate, or velocity, of the motion so far: so a motion of 1e-10 metres has the same steps as in ångströms. A
+velocity moves a coordinate by h times as much, so that S of the velocities is at least S of the coordinates divided by
+the longest step so far: velocities of a motion at rest are rounding. At the start S is predicted by the series: the
+largest of its terms over a step proportional to it, so that a body at rest at 1e-50 has the size that it will have one
+step later. If half the steps of such a motion are rejected, the prediction is rounding, and S becomes infinite, as it
+is for a motion at rest at q = 0, which has no size. Alternatives: a floor for every component would resolve rounding
+where a component is zero by symmetry, and one for every array of the user would depend on how coordinates are grouped.
 """
 
 from collections.abc import Callable
@@ -32,9 +31,9 @@ PARTS = 2  # the motion, and derivatives of it
 
 
 class StepControl:
-    """The emitted code that chooses steps and checks them.
+    """The kernel functions that choose steps and check them.
 
-    Coordinates of one of the `error_groups` are measured by the largest of them. The first `base_size`
+    Coordinates of the same number in `error_groups` are scaled by the largest of them. The first `base_size`
     coordinates are the motion, the others derivatives of it.
     """
 
@@ -73,7 +72,7 @@ class StepControl:
     # ---- the size of a step ----
 
     def choose(self, frame: Frame, order: Value) -> None:
-        """The step of every lane, into `h`: 0, and a code, where it cannot continue."""
+        """Set the step `h` of every lane; 0, with a code, where the motion cannot continue."""
         code = frame.code
         with code.only_if(code.any_lane(code.compare("==", frame["steps"], 0.0))):
             frame.call(self.size_start, order)
@@ -97,7 +96,7 @@ class StepControl:
         frame["last"] = going & is_last
 
     def _last_term_norms(self, frame: Frame, order: Value) -> tuple[Value, Value]:
-        """The scaled norms of the last two coefficients; `scale` keeps 1 / (floor + rtol·size)."""
+        """The scaled norms of the last two coefficients; `scale` is set to 1 / (floor + rtol·size)."""
         code, n = frame.code, self.motion.n
         rtol = code.lanes_of(frame.job("rtol"))
         errors = [code.variable(frame.constant(0.0)) for _ in range(2)]
@@ -119,7 +118,7 @@ class StepControl:
         return errors[0].value, errors[1].value
 
     def _absolute_tolerance(self, frame: Frame, half: int, part: int, sizes: Numbers) -> Value:
-        """The absolute tolerance of the coordinates, or of the velocities (half 1), of a part of the motion."""
+        """The absolute tolerance of the coordinates (half 0) or velocities (half 1) of a part of the motion."""
         code, form, (first, count), place = frame.code, self.motion.form, self.parts[part], 2 * part + half
         given, rtol = (code.lanes_of(frame.job(name)) for name in ("atol", "rtol"))
         largest = form.largest(code, lambda i: sizes[first + i], count)
@@ -134,7 +133,7 @@ class StepControl:
         return code.select(given > 0.0, given, floor)
 
     def _first_step_size(self) -> Code:
-        """`(order)`: `reach` of the lanes that have taken no step; infinite where nothing moves, or rounding does."""
+        """Emit `(order)`: predict `reach` (S) in lanes without steps; infinite if nothing, or only rounding, moves."""
         motion = self.motion
         frame = motion.function("size_start", INTEGER)
         code, (order,) = frame.code, frame.arguments
@@ -168,7 +167,7 @@ class StepControl:
         return frame.finish()
 
     def _forget_size_promise(self, frame: Frame, where: Value) -> None:
-        """Let S be infinite where steps do not hold of a motion that was at rest at zero."""
+        """Set S to infinity where steps of a motion that started at rest at zero are rejected."""
         code, n = frame.code, self.motion.n
         most = code.lanes_of(1.0 / (limits.ATOL_OVER_RTOL * frame.job("rtol")))
         for part, (first, count) in enumerate(self.parts):
@@ -182,7 +181,7 @@ class StepControl:
                     frame["scale", i] = code.select(forgets & (most < scale), most, scale)
 
     def _motion_sizes(self, frame: Frame, half: int) -> Numbers:
-        """The size over the step of every coordinate, or of every velocity (half 1); the largest one of a group."""
+        """The size over the step of every coordinate, or velocity (half 1): the largest one in its error group."""
         code, first = frame.code, half * self.motion.n
         before = code.lanes_of(abs(frame["h"]))
 
@@ -199,7 +198,7 @@ class StepControl:
     # ---- whether its series holds ----
 
     def _step_defect(self) -> Code:
-        """`(order, place)`: h ‖P″ − q̈(P, P′)‖ / (p+1) there, into `defect` if larger, and P − y into `increment`."""
+        """Emit `(order, place)`: `defect` = max with h ‖P″ − q̈(P, P′)‖ / (p+1) there; `increment` = P − y."""
         motion, n = self.motion, self.motion.n
         frame = motion.function("defect", INTEGER, DOUBLE)
         code, (order, place), h = frame.code, frame.arguments, frame["h"]
@@ -221,7 +220,7 @@ class StepControl:
         return frame.finish()
 
     def _acceleration_noise(self, frame: Frame, acceleration, increments, moved) -> Callable[[Index], Value]:
-        """The part of component i of an acceleration that rounding may leave at a place of the step."""
+        """A function of i: the rounding error of component i of an acceleration within the step."""
         code, n, form = frame.code, self.motion.n, self.motion.form
 
         def size_of(numbers):
@@ -265,7 +264,7 @@ class StepControl:
                 self._forget_size_promise(frame, bad & often)
 
     def _small_step_reason(self, frame: Frame) -> Value:
-        """Why no step is small enough: the series, or only the way from its end to the constraints."""
+        """The code of a step that became too small: because of its series, or only because of the projection."""
         reason = frame.constant(limits.STEP_TOO_SMALL)
         if self.projector is None:
             return reason
@@ -274,7 +273,7 @@ class StepControl:
     # ---- the step ----
 
     def end_time(self, frame: Frame) -> tuple[Value, Value]:
-        """The time at the end of the step, and what rounding takes from it."""
+        """The time at the end of the step, and its rounding error."""
         t, low, h = frame["t"], frame["t_low"], frame["h"]
         rough = t + h
         part = rough - t
@@ -285,7 +284,7 @@ class StepControl:
         return frame.code.select(is_last, frame["t_end"], after), frame.code.select(is_last, 0.0, rest)
 
     def advance(self, frame: Frame, after: Value, rest: Value, kicks: bool) -> None:
-        """The time and the state at the end of the step, what rounding takes carried along; and one step more."""
+        """Set time and state, with carried rounding errors, to the end of the step, and count it."""
         code, h = frame.code, frame["h"]
         moving = frame["counts"] > 0.0 if kicks else code.compare("!=", h, 0.0)
         frame.assign(moving, t=after, t_low=rest)
@@ -302,15 +301,15 @@ class StepControl:
 
 
 def absolute_tolerance(frame: Frame) -> Value:
-    """The absolute tolerance of numbers whose units are not those of the state, as of a border."""
+    """The absolute tolerance of numbers whose units differ from those of the state, such as guards."""
     given = frame.job("atol")
     return frame.code.select(given > 0.0, given, limits.ATOL_OVER_RTOL * frame.job("rtol"))
 
 
 def _approximate_power(code: Code, x: Value, exponent: Value) -> Value:
-    """x**exponent to one per cent, for 0 < −exponent < 1/4, which is all that the size of a step needs.
+    """The power x**exponent to one per cent, for 0 < −exponent < 1/4: enough for the size of a step.
 
-    The bits of a number, read as an integer, are nearly its logarithm; the parabolas mend the fractional part.
+    The bits of a number, read as an integer, are nearly its logarithm; parabolas correct the fractional part.
     """
     unit, bias = 2.0**52, 1023.0
     bits = code.as_number(code.bits(x)) / unit - bias

@@ -1,9 +1,9 @@
-"""Watches: numbers that are followed along a step against a level, and what is remembered of each.
+"""Watches: numbers that are compared with a level along a step, and what is remembered of each.
 
-A watch looks for the instant at which its number reaches the level from its side. If a motion begins on the level, or
-moves along it, that is remembered as a `Touch`: rounding must not decide on which side the next step begins. What
-happens at the instant is one of three things: the motion takes the piece beyond (`Border`, `_border_control`), it stops
-there, or a note is made and it continues (`_events`).
+A watch finds the instant at which its number reaches the level from its side. If a motion starts on the level, or moves
+along it, that is remembered as a `Touch`: rounding must not decide on which side the next step begins. At the instant
+the motion enters the next piece (`Border`, `_border_control`), or it stops, or it is recorded and continues
+(`_events`).
 """
 
 import functools
@@ -32,21 +32,21 @@ END_OF_STEP: Fields = {
 
 
 def end_at_border(frame: Frame) -> Value:
-    """The step up to the first border."""
+    """The length of the step up to the first border."""
     return frame["nearest"] * frame["planned"]
 
 
 def reaches_border(frame: Frame) -> Value:
-    """True if the step goes as far as to the first border."""
+    """True if the step reaches the first border."""
     return frame.code.compare("==", frame["h"], end_at_border(frame))
 
 
 class Touch(IntEnum):
-    """The contact of a number with its level where a step begins: none, of its value, of its rates too, for good.
+    """The contact of a number with its level at the start of a step: none, of its value, of rates too, permanent.
 
-    Numbers between count the rates that are zero, and one for the value. A root that is there already is none to be
-    found, and rounding must not make one of it. A guard that `CONTINUES` was zero at the end of the last step, and is
-    so still if it has not jumped; a border is as it is written, since both sides do not push onto it.
+    Values between count the rates that are zero, and one for the value. A root at the start is not searched for, and
+    rounding must not produce one. A guard that `CONTINUES` was zero at the end of the last step, and still is unless it
+    jumped; for a border it means that the program is evaluated on the border, since the sides do not push onto it.
     """
 
     CONTINUES = -1
@@ -67,7 +67,7 @@ class Crossed(IntEnum):
 
 
 class Hit(IntEnum):
-    """The borders that a step ends at: none whose instant varies, one, or several at one instant."""
+    """The kind of border at the end of a step: none whose instant varies, one, or several at one instant."""
 
     NONE = 0
     BORDER = 1
@@ -80,7 +80,7 @@ _PLACES = ("piece", "back", "slide", "on", "order", "rest", "gains", "of_table")
 
 @dataclass(frozen=True, eq=False)
 class Watch:
-    """A number that is followed: row `g` of a `table` of constants; its memory has a row in fields of the frame."""
+    """A followed number: row `g` of a `table` of constants; its memory has one row in fields of the frame."""
 
     frame: Frame
     table: Any
@@ -91,11 +91,11 @@ class Watch:
         return self.frame.code
 
     def __getitem__(self, name: str) -> Value:
-        """A constant, an integer."""
+        """The constant `name` of this watch, an integer."""
         return self.table.read(self.code, self.g, name)
 
     def number(self, name: str) -> Value:
-        """A constant as a number, in all lanes."""
+        """The constant `name` of this watch as a double, in all lanes."""
         return self.code.lanes_of(self.code.as_double(self[name]))
 
     def recall(self, name: str) -> Value:
@@ -106,7 +106,7 @@ class Watch:
 
 
 class Columns:
-    """Rows of integers, or of doubles, as constants of a kernel, for loops over them; columns have names."""
+    """A table of integer or double constants in a kernel, with named columns, for loops over its rows."""
 
     watch: type = Watch
 
@@ -120,20 +120,20 @@ class Columns:
         return code.load(code.element(Value(code, self._data), place, self._kind), self._kind)
 
     def each(self, frame: Frame) -> Iterator[Any]:
-        """The watches of all rows, one after the other, for a body that is written down once, in a loop."""
+        """The watches of all rows, in an emitted loop: its body is emitted once."""
         with frame.code.loop(self.count) as g:
             yield self.watch(frame, self, g)
 
 
 class Border(Watch):
-    """The watch of a guard of a piece (`_program._borders.Guard`); numbers that are −1 are not there."""
+    """The watch of a guard of a piece (`_program._levels.Guard`); a number −1 means none."""
 
     @property
     def touch(self) -> Value:
         return self.recall("touch")
 
     def has(self, name: str, least: int = 0) -> Value:
-        """True, in all lanes, if a number is there, or at `least` this."""
+        """True, in all lanes, if the constant `name` is at least `least`: by default, if it is not −1."""
         return self.number(name) >= float(least)
 
     @property
@@ -160,7 +160,7 @@ class Border(Watch):
         return code.lanes_of(code.flag(code.compare("==", self.rule("beyond").slope, 0.0))) > 0.0
 
     def rule(self, name: str) -> Any:
-        """The `side`, the `level` or the piece `beyond`, as functions of the piece."""
+        """The function of the piece `name`: the `side`, the `level` or the piece `beyond`."""
         rules, kind = self.table.rules, _RULES[name]
         return kind(*(rules.read(self.code, self.g, f"{name}.{of}") for of in kind._fields))
 
@@ -173,18 +173,18 @@ class Border(Watch):
 
 
 def joint_groups(borders: Borders) -> list[int]:
-    """The groups of guards of which several may be crossed in one step, one of each; none where that is not so."""
+    """The group of each guard if borders of different groups may be crossed in one step; else an empty list."""
     apart = not (borders.nested or borders.kicking) and len(set(borders.holding.groups)) > 1
     groups = borders.groups_of_guards if apart else []
     return groups if len({*groups} - {-1}) > 1 else []
 
 
 class GuardTable(Columns):
-    """The guards of all pieces as constants of a kernel; and `knots`.
+    """The guards of all pieces as constants of a kernel, and the `knots`.
 
-    A knot is an entry of a table of parameters that the time is on, or one at which L jumps; another one of a table of
-    numbers neither varies nor matters to tangents. There are no derivatives by knots of several tables that coincide:
-    the acceleration between them is not known.
+    A knot is an entry of a table over time whose entries are parameters, or at which L jumps; knots of constant tables
+    do not vary and do not change tangents. There are no derivatives by knots of several tables that coincide: the
+    acceleration between them is unknown.
     """
 
     watch = Border
@@ -206,7 +206,7 @@ class GuardTable(Columns):
         return frame["params", j + self.motion.parameters]
 
     def crosses(self, frame: Frame, kind: Crossed, number: Index | None = None) -> Value:
-        """True if a step ends at a guard, or at knots: at any of them, or at that with this number."""
+        """True if a step ends at a border of this kind: any one, or the one with this number."""
         code, crosses = frame.code, frame.code.compare("==", frame["crossed"], float(kind))
         if number is None:
             return crosses
@@ -220,7 +220,7 @@ class GuardTable(Columns):
         return functools.reduce(Value.__or__, at_knots + [self.crosses(frame, kind) for kind in kinds])
 
     def counts(self, frame: Frame) -> Value:
-        """True if a step is one that is recorded: it has a length, or velocities that jump at its end."""
+        """True if a step is recorded: it has a length, or velocities that jump at its end."""
         return frame["counts" if self.borders.kicking else "stepped"] > 0.0
 
     def kicks(self, frame: Frame) -> Value:
@@ -233,9 +233,9 @@ class GuardTable(Columns):
     # ---- what a step ends at ----
 
     def note_hit(self, frame: Frame, where: Value) -> None:
-        """Note, in some lanes, the pieces, and which switching numbers are zero at the border that a step ends at.
+        """Store, in some lanes, the pieces, and which switching numbers are zero at the border where the step ends.
 
-        That is no guard where a motion begins on it, and a knot only if it is a parameter.
+        A guard on whose border a motion starts does not count, and a knot only if it is a parameter.
         """
         code, moves = frame.code, self.borders.levels_move
         with frame.where(where):

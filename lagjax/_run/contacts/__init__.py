@@ -1,13 +1,15 @@
 """Motions with contacts: gaps and velocities that stay ≥ 0, impacts, rest and friction.
 
     System(contacts=…) ─► ContactPlan ─► _contact_motion ─► ContactEnding, RoundRecord ─► Trajectory
-                                          ├─ _contact_search: what happens, by loops over numbers, which _places names
+                                          ├─ _contact_search: the events, by loops over numbers, laid out by _places
                                           │    ├─ _law: which contacts push, stick and slide in an impact
                                           │    └─ _scene_code: a scene as the search takes it, and its runs
                                           ├─ _replay: the same with derivatives;  _impact_law: those of impulses
                                           └─ _corners: where gaps change their direction
 
-Source: Moreau, *Unilateral contact and dry friction* (1988); Brogliato, *Nonsmooth Mechanics* (2016).
+A *watch* is a number that stays positive until the state of a contact changes; a *stretch* is the motion between two
+changes; a *round* is one stretch with the change at its end. Source: Moreau, *Unilateral contact and dry friction*
+(1988); Brogliato, *Nonsmooth Mechanics* (2016).
 """
 
 import dataclasses
@@ -53,7 +55,7 @@ CHANGES = 1024  # the budget of changes of a motion whose crossings are asked fo
 
 
 def follow_contacts(given: Problem, problem: Problem, max_transitions: int | None) -> Trajectory:
-    """The motion of a problem whose system has contacts; `problem` is `given` with what it closes over lifted."""
+    """The motion of a problem with contacts; `problem` is `given` with closed-over arrays as parameters."""
     plan, *scenes = _plan_contacts(problem, max_transitions)
     _require_valid_contacts(problem, *scenes)
     if has_constraints(problem.system):
@@ -71,7 +73,7 @@ _follow_compiled = compile_for_one_call(_follow_contacts)  # outside of `jit` on
 
 
 def _put_on_device(trajectory: Trajectory) -> Trajectory:
-    """The trajectory with arrays of JAX in place of all of NumPy: put together, and not each."""
+    """The trajectory with NumPy arrays converted to JAX arrays, in one transfer."""
     numbers, rest = eqx.partition(trajectory, lambda x: isinstance(x, np.ndarray | np.generic))
     return eqx.combine(jax.device_put(numbers), rest)
 
@@ -95,7 +97,7 @@ def _contact_outcome(plan: ContactPlan, problem: Problem) -> tuple[ContactEnding
 
 
 def note_sections(problem: Problem, functions: tuple, directions: tuple[int, ...], room: int) -> tuple:
-    """The changes of a motion with contacts: which section each is, or −1; its time and state; how it all ended.
+    """The changes of a motion with contacts: the section of each, or −1; its time and state; result and end.
 
     Raises `ValueError` as `follow_contacts` does.
     """
@@ -111,7 +113,7 @@ def note_sections(problem: Problem, functions: tuple, directions: tuple[int, ...
 def _plan_contacts(problem: Problem, max_transitions: int | None) -> tuple[ContactPlan, Problem, Problem]:
     """The plan, and the problems of machine code with all contacts closed, and without contacts, in float64.
 
-    Raises `ValueError` where the scene has no machine code, or the motion goes back in time.
+    Raises `ValueError` if the scene has no machine code, or the motion runs backward in time.
     """
     max_transitions = 256 if max_transitions is None else max_transitions
     require_budget(max_transitions, "max_transitions")
@@ -146,7 +148,7 @@ def _plan_contacts(problem: Problem, max_transitions: int | None) -> tuple[Conta
 
 
 def _require_valid_contacts(problem: Problem, closed: Problem, free: Problem) -> None:
-    """Raise `ValueError` for what can be known to be wrong of the gaps at the start and of the coefficients."""
+    """Raise `ValueError` for negative gaps at the start and invalid coefficients, if they are concrete."""
     if problem.is_known:
         with jax.enable_x64(True):
             _require_positive_gaps(problem, closed, free)
@@ -154,7 +156,7 @@ def _require_valid_contacts(problem: Problem, closed: Problem, free: Problem) ->
 
 
 def _require_positive_gaps(problem: Problem, closed: Problem, free: Problem) -> None:
-    """Raise `ValueError` where the motion starts with a negative gap, beyond the rounding of its numbers."""
+    """Raise `ValueError` if the motion starts with a negative gap, beyond the rounding of its numbers."""
     derivation, n = closed.derivation.lowered, problem.layout.size
     shapes = Shapes.from_system(problem.system, problem.layout, problem.params)
     y0, numbers = np.asarray(closed.y0, float), np.asarray(closed.vector, float)
@@ -205,9 +207,9 @@ def _trajectory(
 
 
 def contact_forces(trajectory: Trajectory, name: str):
-    """At every output the `multipliers` of constraints, `constraint_force`, or the normal `contact_forces`, by name.
+    """The named quantity at every output: `multipliers`, `constraint_force`, or the normal `contact_forces`.
 
-    NaN where the motion did not arrive.
+    NaN at times that the motion did not reach.
     """
     system = trajectory.system
     assert isinstance(system, System)

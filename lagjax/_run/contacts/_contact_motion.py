@@ -1,4 +1,4 @@
-"""The motion of a scene with contacts: a search for what happens, without derivatives, and a replay, which has them.
+"""The motion of a scene with contacts: a search for events, without derivatives, and a replay with derivatives.
 
 ContactPlan, start ─► SceneCode.search ─► Found ─► attach_derivative(Replay) ─► ContactEnding, RoundRecord, impacts
 """
@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine.taylor import Surfaces, Tolerances, line_of, make_flow, require_one_number, vector_of
 from lagjax._equations import Derivation, derivation_of, forms
@@ -25,8 +26,6 @@ from lagjax._run.jumps import Found, JumpLaw, Mode, SceneCode, mask_rows
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes
 from lagjax._tracing import Program, compose, lower
 
-PyTree = Any
-
 LAW = JumpLaw(PLACES, LOOPS, ("RESTITUTION", "MU"), ("DOUBTS", "DOUBTED"))
 LAWS = "simultaneous", "sequential", "poisson"
 # Operations that have a series everywhere, which hides nothing.
@@ -36,7 +35,7 @@ _SEEN = frozenset(("input", "constant", "convert", "add", "sub", "mul", "neg", "
 class ContactPlan(eqx.Module):
     """The constants of a run: the scene, its budgets, and whether the start came in float32.
 
-    The `sections` are watched, too, each for changes of its sign in its direction, of which a round makes a note.
+    The `sections` are watched for sign changes too, each in its direction; a round records one.
     """
 
     scene: ContactScene
@@ -48,7 +47,7 @@ class ContactPlan(eqx.Module):
 
 
 class ContactEnding(NamedTuple):
-    """A motion as a whole: its outputs, where and how it ended, and what is doubtful (as in `ContactChanges`)."""
+    """A whole motion: its outputs, its end, its result, and its doubtful events (as in `ContactChanges`)."""
 
     path: Any  # (T, 2n), NaN where not reached
     of_path: Contacts  # what the contacts did at the outputs, −1 where not reached
@@ -62,7 +61,7 @@ class ContactEnding(NamedTuple):
 
 
 class RoundRecord(NamedTuple):
-    """The changes of a motion (N, …), NaN and −1 where there is none: times, velocities before, states behind them.
+    """The changes of a motion (N, …), NaN and −1 if there is none: times, velocities before, states after them.
 
     The impulses (N, k) are normal ones.
     """
@@ -76,9 +75,9 @@ class RoundRecord(NamedTuple):
 
 
 class SearchedScene(NamedTuple):
-    """A scene that has been made ready: its replay, and its functions in flat coordinates.
+    """A scene prepared for runs: its replay, and its functions in flat coordinates.
 
-    `coefficients` is the program of e and μ, (k + r,), of the numbers of params; None where they have none.
+    `coefficients` is the program of e and μ, (k + r,), from the numbers of params; None without one.
     """
 
     replay: ContactReplay
@@ -90,9 +89,9 @@ class SearchedScene(NamedTuple):
 def contact_motion(
     plan: ContactPlan, layout: Layout, ts, y0, params: PyTree
 ) -> tuple[ContactEnding, RoundRecord, tuple]:
-    """The motion from y0 (2n,) at ts[0], its changes, of which there may be `max_transitions`, and its impacts.
+    """The motion from y0 (2n,) at ts[0], its changes, at most `max_transitions`, and its impacts.
 
-    Those are their times, the normal impulses, the energy that was lost, and their count.
+    Impacts are given by their times, the normal impulses, the energy lost, and their count.
     """
     ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
     numbers, scene = eqx.filter(params, eqx.is_array_like), scene_of(plan, layout, params, len(ts))
@@ -101,10 +100,9 @@ def contact_motion(
 
 
 def follow_known(plan: ContactPlan, layout: Layout, params: PyTree, ts, y0, vectors) -> tuple:
-    """The motions of members whose numbers are known, with members in front: `y0` (N, 2n), `ts` (N or 1, T), `vectors`
-    (N or 1, P).
+    """The motions of N members with concrete numbers: `y0` (N, 2n), `ts` (N or 1, T), `vectors` (N or 1, P).
 
-    `params` are those of one member. There is room for as many changes as there were.
+    `params` are those of one member. The records are as long as the largest number of changes.
     """
     scene, members = scene_of(plan, layout, params, ts.shape[1]), len(y0)
     vectors = np.broadcast_to(np.asarray(vectors, float), (members, np.shape(vectors)[-1]))
@@ -120,7 +118,7 @@ def follow_known(plan: ContactPlan, layout: Layout, params: PyTree, ts, y0, vect
 
 
 def _coefficients_at(flat: Flat, params: PyTree, vector) -> list[np.ndarray]:
-    """e and μ for the numbers (P,) of parameters of this structure."""
+    """The coefficients e and μ for the numbers (P,) of parameters of this structure."""
     numbers, structure = jax.tree.flatten(eqx.filter(params, eqx.is_array_like))
     parts = np.split(vector, np.cumsum([np.size(x) for x in numbers])[:-1])
     given = structure.unflatten([part.reshape(np.shape(x)) for part, x in zip(parts, numbers, strict=True)])
@@ -128,7 +126,7 @@ def _coefficients_at(flat: Flat, params: PyTree, vector) -> list[np.ndarray]:
 
 
 def _arrange_outcome(scene: SearchedScene, found: Found, row, played: Played, inputs: tuple) -> tuple:
-    """The ending, the changes, and the impacts in front; of what varies with `inputs`, if it is traced."""
+    """The ending, the changes, and the impacts first; differentiable by `inputs`, if these are traced."""
     library: Any = jnp if inputs else np
 
     code = scene.replay.code
@@ -161,7 +159,7 @@ def _arrange_outcome(scene: SearchedScene, found: Found, row, played: Played, in
 
 
 def scene_of(plan: ContactPlan, layout: Layout, params: PyTree, times: int) -> SearchedScene:
-    """The scene for parameters of this structure and a number of outputs."""
+    """The prepared scene for parameters of this structure and a number of outputs."""
     flat = Flat.from_system(plan.scene.system, layout, params)
     inside = InContact(params, opened(flat, layout.size))
     numbers = vector_of(eqx.filter(inside, eqx.is_array_like))
@@ -200,7 +198,8 @@ def _make_scene(
     acceleration = line_of((open_derivation if corners is None else derivation).accelerations.program, n)
     lines = {"RESPONSE": line_of(response), "BENDS": line_of(bends).with_derivative, "ACCELERATION": acceleration}
     if scene.system.impacts == "poisson" and r:
-        lines["CONSTRUCT"] = line_of(lower(_routh_construction, jax.ShapeDtypeStruct((8,), float)))
+        construct = lambda x: construct_impulses(x[:4].reshape(2, 2), x[4:6], x[6:7], x[7:])  # noqa: E731
+        lines["CONSTRUCT"] = line_of(lower(construct, jax.ShapeDtypeStruct((8,), float)))
     if corners is not None:
         lines["SIDES"] = line_of(corners.sides)
         lines["SIDE_SLOPES"] = lines["SIDES"].forward
@@ -220,11 +219,6 @@ def _make_scene(
     return SearchedScene(ContactReplay(searched, flow), flat, _lower_coefficients(flat, derivation.numbers.params))
 
 
-def _routh_construction(x):
-    """Routh's construction of the coupling (2, 2) and rates (2,) of a contact, then e and μ."""
-    return construct_impulses(x[:4].reshape(2, 2), x[4:6], x[6:7], x[7:])
-
-
 def _lower_coefficients(flat: Flat, numbers: PyTree) -> Program | None:
     try:
         return lower(lambda p: jnp.concatenate([flat.restitution(p), flat.friction(p)]), numbers)
@@ -233,13 +227,13 @@ def _lower_coefficients(flat: Flat, numbers: PyTree) -> Program | None:
 
 
 def _flat_functions(derivation: Derivation, scene: ContactScene, structure, code: tuple) -> Flat:
-    """The functions of contacts for parameters of which `code` and `structure` are what is not a number."""
+    """The functions of contacts; `code` and `structure` are the parts of the parameters that are not numbers."""
     zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), derivation.numbers)
     return Flat.from_system(scene.system, derivation.layout, eqx.combine(zeros, structure.unflatten(code)).params)
 
 
 def opened(flat: Flat, n: int) -> Contacts:
-    """Contacts of n coordinates that are all open."""
+    """The contact states, for n coordinates, in which all are open."""
     (k, r), d, held = (flat.shapes.count, flat.rough.size), flat.shapes.directions, held_size(flat.shapes, n)
     return Contacts(np.zeros(k), np.ones(r), np.ones((r, d)), np.zeros(held), np.zeros(()))
 
@@ -251,10 +245,10 @@ def held_size(shapes: Shapes, n: int) -> int:
 
 
 def slots_of(whole: Derivation, flat: Flat) -> tuple[int, int] | None:
-    """The most independent rows of gaps, and of velocities, that hold at once; None to hold all rows as they are.
+    """The most independent rows of gaps, and of velocities, active at once; None to keep all rows.
 
-    They are ranks at random states, where rows have no corners. The slips of few contacts may hold
-    more in addition to their gaps than those of all do: all sets are looked at whose gaps leave some rank.
+    They are ranks at random states, for rows without corners. The slips of few contacts may add more to the rank of
+    their gaps than those of all do: all sets whose gaps leave some rank are tested.
     """
     places, shapes, n = RowPlaces.from_derivation(whole, flat), flat.shapes, whole.layout.size
     if not held_size(shapes, n) or shapes.count > flat.gap_count or corners_of(whole, places.all, shapes) is not None:
@@ -277,7 +271,7 @@ def slots_of(whole: Derivation, flat: Flat) -> tuple[int, int] | None:
 
 
 def _all_multipliers(derivation: Derivation, scene: ContactScene, flat: Flat) -> Program:
-    """All multipliers; with slots those of the contacts, (k + r d,)."""
+    """The program of all multipliers; with slots those of the contacts, (k + r d,)."""
     if scene.slots is None:
         return derivation.accelerations.multipliers
     moving, positions = 2 * derivation.layout.size + 1, derivation.position_count
@@ -292,7 +286,7 @@ def _all_multipliers(derivation: Derivation, scene: ContactScene, flat: Flat) ->
 
 
 class RowPlaces(NamedTuple):
-    """The places of the rows of contacts among all: those of the normals (k,) and of the slips (r, d)."""
+    """The row numbers of contacts among all constraints: those of the normals (k,) and of the slips (r, d)."""
 
     normal: np.ndarray
     tangential: np.ndarray
@@ -314,9 +308,9 @@ class RowPlaces(NamedTuple):
 def _contact_watches(
     derivation, scene: ContactScene, turns: int, sections: tuple, ways: tuple, code: tuple, structure, single
 ) -> Surfaces:
-    """The watches of all contacts as programs: the k normal ones, those of friction, r, of corners, and the sections.
+    """The watches of all contacts as programs: the k normal ones, r of friction, those of corners, the sections.
 
-    `code` and `structure` are what the parameters hold that is not a number.
+    `code` and `structure` are the parts of the parameters that are not numbers.
     """
     flat = _flat_functions(derivation, scene, structure, code)
     shapes, rough = flat.shapes, flat.rough

@@ -1,25 +1,26 @@
-"""The search for what contacts do: from stretch to stretch of a motion, on numbers, without derivatives.
+"""The search for events of contacts: stretch by stretch of a motion, on numbers, without derivatives.
 
 A contact has watches that stay positive: its gap, or one-way velocity, while it is open, its normal force λ while it is
 closed; with friction the slip in its direction while it slides, μ²λ² − f² while it sticks. One program serves all
-contacts, whatever they do (`InContact`). Where a watch falls,
+contacts in any state (`InContact`). When a watch becomes negative,
 
-    a gap             impulses, where the contact moves inwards (`_law`); else the contact closes
+    a gap             impulses, if the contact approaches (`_law`); else the contact closes
     λ                 it opens
     the slip          it sticks
-    what friction has left    it slides, against the force that held it
+    μ²λ² − f²         it slides, against the force that held it
 
-A guess that is wrong is a watch that begins beyond zero, or whose first coefficient that is not rounding is negative:
-it falls at once, and the next round takes it back (`_native.steps._events`). That is Murty's principal pivoting, over
-series in place of numbers (Murty, Linear Algebra Appl. 5 (1972) 65; Heemels, Schumacher & Weiland, ibid. 294 (1999)
-93). Bounces that accumulate end at a closed form of their limit (`end_bounces`).
+A wrong guess is a watch that starts negative, or whose first coefficient above rounding is negative: it falls at once,
+and the next round takes the guess back (`_native.steps._events`). That is Murty's principal pivoting, over series in
+place of numbers (Murty, Linear Algebra Appl. 5 (1972) 65; Heemels, Schumacher & Weiland, ibid. 294 (1999) 93). Bounces
+that accumulate end at a closed form of their limit (`end_bounces`).
 
     follow ─► begin ─► prepare: sides and rounding of all watches ─► the kernel ─► finish ─► decide: a row of the record
                           ▲                                                                     │
                           └─────────────────────────────────────────────────────────────────────┘
 
-`scene` holds sizes, addresses of machine code, and the places of what is remembered of a member, its `member`, and of
-what a `row` of the record says; they are declared in `_places`. A flag is 0 or 1. `work` is scratch memory.
+`scene` has sizes, addresses of machine code, and the offsets of the fields of a member's memory (`member`) and of a
+`row` of the record; they are declared in `_places`. A flag is 0 or 1. `work` is scratch memory. Functions write their
+results into their array arguments.
 """
 
 from math import isfinite, sqrt
@@ -69,7 +70,7 @@ TOGETHER = 1e-8
 HARDLY = 1e-6  # of the largest velocities so far: a contact that moves apart slower may close
 GAINED = 1e-12  # of the room of an impact: a gain of energy beyond rounding
 # Of the largest slip so far: what is more, where the slip along its first direction ends, has turned.
-TURNED = 1e-6
+RATE_JUMP_TOLERANCE = 1e-6
 # After a corner a motion continues from this fraction of the terms of its switching number beyond it. An event stops
 # it `BEFORE` the corner: steps that end at a border may be rejected, and halve the rest.
 BEYOND, BEFORE = 16.0 * EPS, 64.0 * SMALLEST_STEP
@@ -85,7 +86,7 @@ watch, write_times, write_outputs = bind_loops(globals())
 
 @loop
 def find_length(x: Floats, count: int) -> float:
-    """The length of a vector (count,)."""
+    """The Euclidean length of a vector (count,)."""
     total = 0.0
     for i in range(count):
         total += x[i] ** 2
@@ -94,7 +95,7 @@ def find_length(x: Floats, count: int) -> float:
 
 @loop
 def open_all(scene: Scene, x: Floats, opened: Floats):
-    """Put the inputs of lines at the state of inputs x with all contacts open."""
+    """Write into `opened` the inputs of the lines: the state of inputs x, with all contacts open."""
     k, r, d = scene.k, scene.r, scene.d
     first = 2 * scene.n + 1 + scene.numbers
     copy(x, opened, first)
@@ -104,7 +105,7 @@ def open_all(scene: Scene, x: Floats, opened: Floats):
 
 @loop
 def find_held(scene: Scene, x: Floats) -> int:
-    """The mode at inputs x: whether any contact is closed."""
+    """The mode at inputs x: `HELD` if any contact is closed, else `OPEN`."""
     for i in range(scene.k):
         if x[2 * scene.n + 1 + scene.numbers + i] > 0:
             return HELD
@@ -119,7 +120,7 @@ def find_mode(scene: Scene, member: Member) -> int:
 
 @loop
 def has_missed(scene: Scene, member: Member, watches: Floats, i: int, closed: bool) -> bool:
-    """True for a gap that is negative though it was followed, and open: its series did not show that."""
+    """True for an open contact whose gap is negative: its series did not show the root."""
     if scene.may_miss == 0 or i >= scene.gaps or closed:
         return False
     total = scene.watches
@@ -129,7 +130,7 @@ def has_missed(scene: Scene, member: Member, watches: Floats, i: int, closed: bo
 
 @loop
 def touch(scene: Scene, member: Member, opened: Floats, room: Room):
-    """Put which contacts touch, how fast they move apart, and the rounding of that; inputs have all contacts open."""
+    """Write the contacts that touch, their separation speeds, and the rounding of these; all are open in the inputs."""
     total, watches = scene.watches, room.watched
     watch(scene, member, opened, OPEN, watches, room.free)
     for i in range(scene.k):
@@ -141,7 +142,7 @@ def touch(scene: Scene, member: Member, opened: Floats, room: Room):
 
 @loop
 def measure_slips(scene: Scene, member: Member, rates: Floats, v: Floats, slips: Floats, room: Room):
-    """Put 1 for each slip that is none, beside the largest so far, then the lengths of all: (r,) each."""
+    """Write into `slips` 1 for each slip that is zero relative to the largest so far, then all lengths: (r,) each."""
     k, r, d, n, gradients = scene.k, scene.r, scene.d, scene.n, room.gradients
     for c in range(r):
         terms = 0.0
@@ -159,7 +160,7 @@ def measure_slips(scene: Scene, member: Member, rates: Floats, v: Floats, slips:
 
 @loop
 def locate_corners(scene: Scene, member: Member, x: Floats, room: Room) -> float:
-    """Put the sides of corners at inputs x, their rates, and the distance to continue beyond: (corners,) each.
+    """Write the sides of corners at inputs x, their rates, and the distance to move beyond: (corners,) each.
 
     Returns the distance below which a state counts as on a corner.
     """
@@ -191,9 +192,9 @@ def locate_corners(scene: Scene, member: Member, x: Floats, room: Room) -> float
 
 @loop
 def go_beyond(scene: Scene, member: Member, x: Floats, room: Room) -> float:
-    """Put by how much the state at inputs x moves beyond the corners that are passed; returns by when.
+    """Write the displacement of the state beyond the corners that are passed; the time that it takes.
 
-    Negative where the motion rests on one.
+    Negative if the motion rests on one.
     """
     n, count, corners, shift = scene.n, scene.corners, room.corner, room.shift
     later, rests = 0.0, False
@@ -219,9 +220,9 @@ def go_beyond(scene: Scene, member: Member, x: Floats, room: Room) -> float:
 
 @loop
 def begin(scene: Scene, member: Member, room: Room) -> int:
-    """The result of a start, whose inputs and coefficients are there, with all contacts open: `GOING` if it is sound.
+    """The result of a start, whose inputs and coefficients are set, with all contacts open: `GOING` if it is valid.
 
-    Those that touch and do not move apart fall at once.
+    The gaps of contacts that touch and do not separate fall at once.
     """
     n, k, r, total = scene.n, scene.k, scene.r, scene.watches
     x, watches, deciding = member.x, room.watched, total - scene.sections
@@ -260,7 +261,7 @@ def begin(scene: Scene, member: Member, room: Room) -> int:
 
 @loop
 def rests_on_corner(scene: Scene, member: Member, room: Room) -> bool:
-    """True where a contact that starts on its corner rests there; else the state goes where the motion does."""
+    """True if a contact that starts on its corner rests there; otherwise the state is moved with the motion."""
     n, k, x, corners, passed = scene.n, scene.k, member.x, room.corner, room.passed
     locate_corners(scene, member, x, room)
     for p in range(scene.corners):
@@ -278,7 +279,7 @@ def rests_on_corner(scene: Scene, member: Member, room: Room) -> bool:
 
 @loop
 def starts_inside(scene: Scene, member: Member, room: Room) -> bool:
-    """True where a gap is negative at the start, by more than the rounding of what leads a motion there."""
+    """True if a gap is negative at the start, by more than the rounding along a motion that led there."""
     n, total, x, rises, watches = scene.n, scene.watches, member.x, room.free, room.watched
     evaluate(scene.acceleration, x, rises)
     for i in range(scene.gaps):
@@ -290,10 +291,10 @@ def starts_inside(scene: Scene, member: Member, room: Room) -> bool:
 
 @loop
 def find_start_width(n: int, x: Floats, slopes: Floats, rises: Floats, first: float, last: float) -> float:
-    """The depth at which a gap with these `slopes` (n,) may begin: the rounding of what leads a motion there.
+    """The depth at which a gap with these `slopes` (n,) may start: the rounding of a motion that led there.
 
-    A gap that is a coordinate is 1e-16 where it closes, and its rounding that of the height from which it fell.
-    `rises` (n,) is the acceleration at the start x.
+    A gap that is a coordinate is 1e-16 where it closes, and its rounding that of the height from which it fell. `rises`
+    (n,) is the acceleration at the start x.
     """
     furthest, width = 0.0, 0.0
     for j in range(n):
@@ -306,7 +307,7 @@ def find_start_width(n: int, x: Floats, slopes: Floats, rises: Floats, first: fl
 
 @loop
 def write_directions(scene: Scene, vectors: Floats, units: Floats):
-    """Put the unit vectors along `vectors` (r, d), zero of none."""
+    """Write into `units` the unit vectors along `vectors` (r, d), zero for a zero vector."""
     d = scene.d
     for c in range(scene.r):
         length = find_length(vectors[c * d :], d)
@@ -316,9 +317,9 @@ def write_directions(scene: Scene, vectors: Floats, units: Floats):
 
 @loop
 def has_paradox(scene: Scene, member: Member, push: Floats, sticks: Floats, direction: Floats, room: Room) -> bool:
-    """True where friction leaves nothing of a contact's response to its normal force.
+    """True if friction cancels a contact's response to its normal force.
 
-    There no force, or more than one, keeps it closed: Painlevé's paradox.
+    Then no force, or more than one, keeps it closed: Painlevé's paradox.
     """
     k, r, d, rough, coupling = scene.k, scene.r, scene.d, scene.rough, room.coupling
     size = k + r * d
@@ -334,7 +335,7 @@ def has_paradox(scene: Scene, member: Member, push: Floats, sticks: Floats, dire
 
 @loop
 def note_rounding(scene: Scene, member: Member, duration: float):
-    """Note the largest rounding of the watches: of one that went away and came back that between them."""
+    """Record the largest rounding of each watch so far, also of one that was inactive in between."""
     total, watches, kinds = scene.watches, member.guards, member.kinds
     values, rates = member.rounding, member.rate_rounding
     for g in range(total):
@@ -348,10 +349,10 @@ def note_rounding(scene: Scene, member: Member, duration: float):
 
 @loop
 def write_sides(scene: Scene, member: Member, sides: Floats, rates: Floats):
-    """Put the sides (G,) of all watches from which the motion comes, and the rounding of their rates, (G,).
+    """Write the sides (G,) of all watches from which the motion comes, and the rounding of their rates, (G,).
 
-    A tie is a contact that turns at an instant without end: closed, its force is none if rounding of the gap could make
-    it; it sticks until its value falls, a rate is no reason.
+    A tie is a contact whose state changes repeatedly at an instant: if closed, its force counts as zero if rounding of
+    the gap could cause it; it sticks until the value of its watch falls, whatever the rate.
     """
     k, r, total, rough = scene.k, scene.r, scene.watches, scene.rough
     watches, kinds, tied = member.guards, member.kinds, member.tied
@@ -383,7 +384,7 @@ def write_sides(scene: Scene, member: Member, sides: Floats, rates: Floats):
 
 @loop
 def prepare(scene: Scene, member: Member, ts: Floats, times: Floats, y: Floats, numbers: Floats, room: Room):
-    """Put the run of a member's next stretch: its times (T + 2,), its start, and its numbers with the sides."""
+    """Write the run of a member's next stretch: its times (T + 2,), its start, and its numbers with the sides."""
     n, k, r, total = scene.n, scene.k, scene.r, scene.watches
     x, kinds, stays = member.x, member.kinds, member.stays
     did, t = x[2 * n + 1 + scene.numbers :], x[2 * n]
@@ -414,9 +415,9 @@ def finish(
     scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, record: Entry, found: Floats, y_end: Floats,
     t_end: float, fell: Floats, event: int, result: int, accepted: float, rejected: float, room: Room
 ):  # fmt: skip
-    """Take a stretch, its outputs `found` (T + 2, 2n) and its end: what the contacts do there, and a row of the record.
+    """Process a stretch, with outputs `found` (T + 2, 2n) and its end: the new contact states, and a row of the record.
 
-    `fell` (G,) says which watches fell or rose, if it is an `event`; `result` is that of a run without one.
+    `fell` (G,) tells which watches fell or rose, if it is an `event`; `result` is that of a run without one.
     """
     n, k, total, x = scene.n, scene.k, scene.watches, member.x
     row = record[int(member.rounds) * scene.row :]
@@ -468,7 +469,7 @@ def finish(
 
 @loop
 def write_passed_outputs(scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, row: Entry):
-    """Put the outputs at which a motion is that continues beyond a corner, also of time."""
+    """Write the outputs between a corner and the state beyond it, where the motion continues."""
     n, x, doing = scene.n, member.x, scene.doing
     for j in range(scene.times):
         if ts[j] <= x[2 * n] and did[j * doing] < 0:
@@ -478,7 +479,7 @@ def write_passed_outputs(scene: Scene, member: Member, ts: Floats, path: Floats,
 
 @loop
 def find_result(scene: Scene, member: Member, reached: int, happens: bool) -> int:
-    """The result of a motion so far, behind a stretch that `reached` this one: `GOING` if all is well."""
+    """The result of a motion so far, after a stretch with the result `reached`: `GOING` if all is well."""
     if happens and member.turns > 16 + 8 * scene.watches:
         return IN_TURN
     if member.missed > 0:
@@ -493,7 +494,7 @@ def find_result(scene: Scene, member: Member, reached: int, happens: bool) -> in
 
 @loop
 def note_stretch(scene: Scene, member: Member, first: int, at_once: bool, duration: float, accepted: float):
-    """Note behind a stretch what is tied, its longest step, and what rounding it had; `first` fell where it ended."""
+    """Record, after a stretch, ties, its longest step, and rounding; watch `first` fell at its end."""
     k, r, total = scene.k, scene.r, scene.watches
     tied, refuted, did = member.tied, member.refuted, member.kinds
     member.turns = member.turns + 1.0 if at_once else 0.0
@@ -512,7 +513,7 @@ def note_stretch(scene: Scene, member: Member, first: int, at_once: bool, durati
 
 @loop
 def check_outputs(scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, room: Room):
-    """Note as the result of a motion that outputs are missing, or that a gap is negative at one."""
+    """Set the result of a motion if outputs are missing, or a gap is negative at one."""
     n, k, times, doing = scene.n, scene.k, scene.times, scene.doing
     x, watches = room.free, room.free[scene.inputs :]
     copy(member.x, x, scene.inputs)
@@ -534,7 +535,7 @@ def check_outputs(scene: Scene, member: Member, ts: Floats, path: Floats, did: F
 
 @loop
 def find_first(scene: Scene, fell: Floats, at_once: bool, did: Floats) -> int:
-    """The watch that is taken of those that `fell` (G,): of corners, then of friction, as one that jams is."""
+    """The watch to process first among those that `fell` (G,): of corners, then of friction, as one that jams is."""
     k, r, rough = scene.k, scene.r, scene.rough
     for g in range(k + r, k + r + 2 * scene.corners):
         if fell[g] > 0:
@@ -553,7 +554,7 @@ def find_first(scene: Scene, fell: Floats, at_once: bool, did: Floats) -> int:
 
 @loop
 def decide(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> int:
-    """The result behind watch `first`, which fell: the member continues from there, as the row says."""
+    """The result after watch `first` fell: set the new state of the member, and record it in the row."""
     n, k, r, x, meets, opening = scene.n, scene.k, scene.r, member.x, row.meets, room.opening
     closed = x[2 * n + 1 + scene.numbers :]
     copy(closed, room.closed, k)
@@ -593,9 +594,9 @@ def decide(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> 
 
 @loop
 def hold_independent(scene: Scene, did: Floats, room: Room) -> bool:
-    """Put the rows by which contacts are held that do not depend on each other; returns whether there is room for them.
+    """Write the independent rows by which contacts are held; returns whether there are enough slots.
 
-    `did` says what the contacts do. Scenes with fewer rows than coordinates hold all.
+    `did` has the contact states. Scenes with fewer rows than coordinates hold all rows.
     """
     k, r, d, gaps = scene.k, scene.r, scene.d, 0
     if scene.gap_slots + scene.slots == 0:
@@ -612,7 +613,7 @@ def hold_independent(scene: Scene, did: Floats, room: Room) -> bool:
 
 @loop
 def note_changes(scene: Scene, member: Member, first: int, hits: bool, row: Entry, room: Room):
-    """Note which contacts have changed, as `CHANGED`, what begins anew there, and which slips begin at rest."""
+    """Record which contacts have changed, as `CHANGED`, which watches restart, and which slips start at rest."""
     n, k, x, leaves_rest = scene.n, scene.k, member.x, False
     closed = x[2 * n + 1 + scene.numbers :]
     for i in range(k):
@@ -634,9 +635,9 @@ def note_changes(scene: Scene, member: Member, first: int, hits: bool, row: Entr
 
 @loop
 def meet_corners(scene: Scene, member: Member, first: int, meets: Floats, room: Room) -> int:
-    """Put which contacts reach a corner where watch `first` fell, and open there; state and time continue beyond it.
+    """Write which contacts reach a corner where watch `first` fell, and open there; move the state beyond it.
 
-    Returns 2 where one is struck at its corner, or stays there, 1 where one meets behind its corner, else 0.
+    Returns 2 if one is struck at its corner, or stays there, 1 if one closes behind its corner, else 0.
     """
     k, count, x, touches = scene.k, scene.corners, member.x, scene.touch
     corners, passed, opening = room.corner, room.passed, room.opening
@@ -660,9 +661,9 @@ def meet_corners(scene: Scene, member: Member, first: int, meets: Floats, room: 
 
 @loop
 def meet(scene: Scene, member: Member, meets: Floats, row: Entry, room: Room) -> bool:
-    """Put which contacts take part where some meet, and what they do: the row says whether it is an impact.
+    """Write which contacts take part where some `meets` close, and their roles; the row tells if it is an impact.
 
-    Returns whether it was missed before.
+    Returns whether its root was missed before.
     """
     k, touches, involved, noise = scene.k, room.touches, room.involved, room.noise
     parting, push, linked = room.parting, room.push, room.stay
@@ -693,7 +694,7 @@ def meet(scene: Scene, member: Member, meets: Floats, row: Entry, room: Room) ->
 
 @loop
 def reach(scene: Scene, meets: Floats, found: Floats, room: Room):
-    """Put the contacts that touch and that an impulse at those that meet reaches, one through the other."""
+    """Write the touching contacts that an impulse at those in `meets` reaches, directly or through others."""
     k, r, d, coupling, rough = scene.k, scene.r, scene.d, room.coupling, scene.rough
     size, touches, reached, done, count = k + r * d, room.touches, room.free, 0, 0
     copy(meets, found, k)
@@ -715,7 +716,7 @@ def reach(scene: Scene, meets: Floats, found: Floats, room: Room):
 
 @loop
 def find_pushes(scene: Scene, member: Member, row: Entry, room: Room):
-    """Put the pattern of an impact: which contacts push, which slips stick, and in which directions others slide."""
+    """Write the pattern of an impact: which contacts push, which slips stick, and the directions of the rest."""
     k, r, d, rough = scene.k, scene.r, scene.d, scene.rough
     mu, e, coupling, rates = member.mu, member.restitution, room.coupling, room.rates
     involved, push = room.involved, room.push
@@ -767,10 +768,10 @@ def close_contacts(scene: Scene, member: Member, first: int, hits: bool, meets: 
         closed[i] = float(stays or (meets[i] > 0 and parts[i] == 0))
     stops = False
     for c in range(r):
-        if k + c == first and was_stuck[c] == 0 and (d == 1 or slips[r + c] <= TURNED * member.slip[c]):
+        if k + c == first and was_stuck[c] == 0 and (d == 1 or slips[r + c] <= RATE_JUMP_TOLERANCE * member.slip[c]):
             stops = True
     for c in range(r):
-        fell = k + c == first and (was_stuck[c] > 0 or d == 1 or slips[r + c] <= TURNED * member.slip[c])
+        fell = k + c == first and (was_stuck[c] > 0 or d == 1 or slips[r + c] <= RATE_JUMP_TOLERANCE * member.slip[c])
         if closed[rough[c]] != was_closed[rough[c]]:
             sticks[c] = slips[c]
         else:
@@ -788,9 +789,9 @@ def close_contacts(scene: Scene, member: Member, first: int, hits: bool, meets: 
 
 @loop
 def find_change(scene: Scene, member: Member, hits: bool, row: Entry, room: Room) -> bool:
-    """Put the impulses, the rates behind them, and the change of velocities; returns whether the law is not obeyed.
+    """Write the impulses, the rates after them, and the change of velocities; returns whether the law is violated.
 
-    Behind an impact they follow its law; else velocities become those that what is held allows.
+    After an impact they follow its law; else velocities are projected onto those that the closed contacts allow.
     """
     n, k, r, d, rough = scene.n, scene.k, scene.r, scene.d, scene.rough
     coupling, rates, push, targets, impulses = room.coupling, room.rates, room.push, room.targets, room.impulses
@@ -822,7 +823,7 @@ def find_change(scene: Scene, member: Member, hits: bool, row: Entry, room: Room
 
 @loop
 def ask_rates(scene: Scene, member: Member, hits: bool, row: Entry, room: Room):
-    """Put the rates behind an impact by its law, unless they are there; else zero, of what is closed and sticks."""
+    """Write the rates required after an impact by its law, unless set; else zero for closed and sticking contacts."""
     k, d, e, targets = scene.k, scene.d, member.restitution, room.targets
     did = member.x[2 * scene.n + 1 + scene.numbers :]
     if not hits:
@@ -846,7 +847,7 @@ def ask_rates(scene: Scene, member: Member, hits: bool, row: Entry, room: Room):
 
 @loop
 def is_violated(scene: Scene, member: Member, row: Entry, room: Room) -> bool:
-    """True where the impulses of an impact do not obey the law; of Poisson's the rates are what compression leaves."""
+    """True if the impulses of an impact violate the law; for Poisson's the rates are what compression leaves."""
     k, r, targets, flags, rest = scene.k, scene.r, room.targets, room.free, room.free[scene.k + scene.r :]
     if scene.law == POISSON:
         if r > 0:  # by construction
@@ -866,7 +867,7 @@ def is_violated(scene: Scene, member: Member, row: Entry, room: Room) -> bool:
 
 @loop
 def end_bounces(scene: Scene, member: Member, row: Entry, room: Room) -> bool:
-    """Put the contacts that bounce and come to rest at once, and add the time that it takes; returns whether any does.
+    """Write which bouncing contacts come to rest at once, and add the time that it takes; returns whether any does.
 
     With gap″ = −b − b′ s the bounces take 2u/(b (1 − e)) (1 − ⅔ k), k = b′ u / b² (1 − e), up to k².
     """
@@ -903,10 +904,10 @@ def end_bounces(scene: Scene, member: Member, row: Entry, room: Room) -> bool:
 
 @loop
 def stay_closed(scene: Scene, member: Member, hits: bool, room: Room):
-    """Close those that stay in touch behind an impact, and press upon each other there.
+    """Close the contacts that stay in touch after an impact, and press upon each other there.
 
-    Their accelerations decide, without friction; with it, or where these are zero, the rounds that follow do. Of
-    contacts that are redundant all stay.
+    Their accelerations decide, without friction; with friction, or where these are zero, later rounds do. All redundant
+    contacts stay closed.
     """
     n, k, r, coupling = scene.n, scene.k, scene.r, room.coupling
     closed, stay, rest = member.x[2 * n + 1 + scene.numbers :], room.stay, room.free
@@ -943,9 +944,9 @@ def stay_closed(scene: Scene, member: Member, hits: bool, room: Room):
 
 @loop
 def rub(scene: Scene, member: Member, first: int, hits: bool, room: Room):
-    """Put which contacts stick behind what happened, and where others slide; `CHANGED` are contacts that have.
+    """Write which contacts stick after a change, and the directions of those that slide; `CHANGED` marks changes.
 
-    They slide against what held those that break away, or along the slip.
+    Contacts that start to slide move against the force that held them, or along their slip.
     """
     n, k, r, d, x, rough = scene.n, scene.k, scene.r, scene.d, member.x, scene.rough
     did, flags, behind = x[2 * n + 1 + scene.numbers :], room.changed, room.slips_behind
@@ -985,7 +986,7 @@ def rub(scene: Scene, member: Member, first: int, hits: bool, room: Room):
 
 @loop
 def write_held_force(scene: Scene, member: Member, c: int, x: Floats, room: Room):
-    """Put the force against which contact c breaks away, that held it before: −f (d,)."""
+    """Write the direction −f (d,) in which contact c starts to slide: against the force that held it before."""
     n, k, r, d, inputs, rows = scene.n, scene.k, scene.r, scene.d, scene.inputs, scene.tangential
     copy(member.x, x, inputs)
     copy(room.closed, x[2 * n + 1 + scene.numbers :], k)
@@ -997,7 +998,7 @@ def write_held_force(scene: Scene, member: Member, c: int, x: Floats, room: Room
 
 @loop
 def count_doubts(scene: Scene, member: Member, hits: bool, row: Entry, room: Room):
-    """Count what is doubtful here: an impact that gains energy, one that is shared, derivatives that are lost."""
+    """Count doubtful events: an impact that gains energy, a shared one, derivatives that do not exist."""
     k, r, d, n = scene.k, scene.r, scene.d, scene.n
     total, terms, shares, starts = 0.0, 0.0, False, row.leaves_rest > 0
     for i in range(k + r * d):
@@ -1017,10 +1018,10 @@ def count_doubts(scene: Scene, member: Member, hits: bool, row: Entry, room: Roo
 
 @loop
 def move(scene: Scene, member: Member, first: int, meets: Floats, row: Entry, room: Room):
-    """Move the state behind a change of velocities, where contacts `meets` close; note what rounding leaves there.
+    """Change the state by the change of velocities, where contacts `meets` close; record what rounding leaves.
 
-    The gap that closes is zero, also as what went in varies: what rounding leaves of it grows with each bounce. What is
-    less than its own rounding is zero: steps would be as short as to follow it.
+    The gap that closes is set to zero, also for its derivatives: its rounding would grow with each bounce. A number
+    below its own rounding is set to zero: otherwise steps would be short enough to resolve it.
     """
     n, k, size, x = scene.n, scene.k, scene.k + scene.r * scene.d, member.x
     responses, coupling, largest = room.responses, room.coupling, member.largest
@@ -1056,7 +1057,7 @@ def move(scene: Scene, member: Member, first: int, meets: Floats, row: Entry, ro
 
 @loop
 def note_force_noise(scene: Scene, member: Member, first: int, room: Room):
-    """Note which forces are none before a change of velocities, and by which rounding could make some."""
+    """Record which forces are zero before a change of velocities, and the rounding that could cause some."""
     n, total, x, longest = scene.n, scene.watches, member.x, member.longest
     values, rates = member.rounding, member.rate_rounding
     lasts = longest if longest > 0 else member.last - member.first
@@ -1076,7 +1077,7 @@ def note_force_noise(scene: Scene, member: Member, first: int, room: Room):
 
 @loop
 def name_change(scene: Scene, first: int, hits: bool, did: Floats, row: Entry, room: Room):
-    """Put the contact of watch `first`, and the kind of its change, into the row."""
+    """Write the contact of watch `first`, and the kind of its change, into the row."""
     k, r, rough = scene.k, scene.r, scene.rough
     contact, change = -1, -1
     if first < k:
@@ -1095,7 +1096,7 @@ def name_change(scene: Scene, first: int, hits: bool, did: Floats, row: Entry, r
 
 @loop
 def start(scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, room: Room):
-    """Begin a member, whose outputs are at `ts`: those that lie before its corner are there."""
+    """Initialise a member with outputs at `ts`, including those that lie before its first corner."""
     n, x, first = scene.n, member.x, member.first
     open_all(scene, x, x)
     for i in range(3):

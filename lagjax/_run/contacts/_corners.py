@@ -1,9 +1,9 @@
 """The corners of contacts: borders at which a gap, its rate or a slip jumps (`abs`, `maximum`, `where`, tables).
 
-While a contact is open, its corners are borders as those of L are, and nothing happens there. A closed contact that
+While a contact is open, its corners are borders like those of L, and nothing happens there. A closed contact that
 reaches a corner opens, and the motion continues a few roundings beyond; the watches of that side then tell whether it
-strikes, stays or leaves. On the corner itself a contact has no unique normal: a motion that is struck there, or rests
-there, ends.
+strikes, stays or separates. On the corner itself a contact has no unique normal: a motion that is struck there, or
+rests there, ends.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from lagjax._tracing import Program
 
 
 class Corners(NamedTuple):
-    """The corners, P of them, of k contacts: which `touch` which (P, k), and a program of the side of each, (P,)."""
+    """The P corners of k contacts: a matrix `touch` (P, k) of which belongs to which, and a program of sides (P,)."""
 
     touch: np.ndarray
     sides: Program
@@ -58,5 +58,5 @@ def _corners_of(derivation, places: tuple[int, ...], rough: tuple[int, ...], gap
 
 
 def append_sides(program: Program, corners: Corners) -> Program:
-    """The program with the sides of corners behind its outputs."""
+    """The program with the sides of corners as further outputs."""
     return dataclasses.replace(program, line=with_outputs(program, corners.sides.line).line)  # type: ignore

@@ -1,8 +1,8 @@
-"""The law of impacts as it varies: impulses of contacts that touch, and velocities behind them.
+"""The law of impacts with derivatives: impulses of contacts that touch, and velocities after them.
 
 With G the rows of k gaps and one-way velocities, and of r d slips, (K, n), q̇⁺ = q̇ + M⁻¹ Gᵀ E Λ, where E adds the
 friction −μ c of a contact that slides to its normal impulse. Newton's law of restitution with Coulomb friction, for all
-contacts that touch at once, asks for
+contacts that touch at once, requires
 
     ġ⁺ + e ġ⁻ ≥ 0  ⟂  Λ ≥ 0        |F| ≤ μ Λ,  F = −μ Λ s⁺/|s⁺| where s⁺ ≠ 0
 
@@ -24,8 +24,8 @@ class ImpactRows(NamedTuple):
     """The rows of contacts at a state: those of the k normals, then those of the slips, d for each of r contacts.
 
     `gradients` G (K, n), `responses` G M⁻¹ (K, n), `coupling` G M⁻¹ Gᵀ (K, K), the `values` of gaps, one-way velocities
-    and slips (K,), the `rates` that impulses change: those of gaps, and the other values; and `bends` (K,), how these
-    change while no contact is closed.
+    and slips (K,), the `rates` that impulses change: those of gaps, and the values of the rest; and `bends` (K,), the
+    rates of these while no contact is closed.
     """
 
     gradients: Any
@@ -37,15 +37,17 @@ class ImpactRows(NamedTuple):
 
     @classmethod
     def split(cls, numbers, size: int, n: int) -> "ImpactRows":
-        """The rows by the outputs of `Accelerations.impact_response` for `size` rows of n coordinates."""
+        """The rows from the outputs of `Accelerations.impact_response` for `size` rows and n coordinates."""
         shapes = (size, n), (size, n), (size, size), (size,), (size,), (size,)
         parts = jnp.split(numbers, np.cumsum([math.prod(shape) for shape in shapes])[:-1])
         return cls(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))
 
 
 class HeldRows(NamedTuple):
-    """The contacts in an impact: the `rows` that are held (K,), 1 or 0, and of the r contacts with friction, which
-    are `rough`, by which coefficient they slide (r,), 0 of others, and in which `direction` (r, d)."""
+    """The contacts in an impact: `rows` (K,) are 1 if held, else 0; `rough` are the r contacts with friction.
+
+    Of these, `slides` (r,) is the coefficient of those that slide, else 0, and `direction` (r, d) that of the slip.
+    """
 
     rows: Any
     slides: Any
@@ -54,15 +56,15 @@ class HeldRows(NamedTuple):
 
     @property
     def places(self) -> np.ndarray:
-        """The rows of the slips, (r, d), behind those of the normals."""
+        """The row numbers of the slips, (r, d), which follow those of the normals."""
         size = len(self.rough) * self.direction.shape[1]
         return len(self.rows) - size + np.arange(size).reshape(self.direction.shape)
 
 
 def find_impulses(rows: ImpactRows, held: HeldRows, targets):
-    """The impulses (K,) by which the rates of contacts that push become these `targets` (k,), and slips that stick 0.
+    """The impulses (K,) that give pushing contacts the rates `targets` (k,), and sticking slips the rate 0.
 
-    The impulse of a row that is free is zero, that of a contact that slides brings its friction.
+    The impulse of a free row is zero; that of a sliding contact includes its friction.
     """
 
     def impulses_along(direction):
@@ -81,9 +83,9 @@ def find_impulses(rows: ImpactRows, held: HeldRows, targets):
 
 
 def _turn_directions(rows: ImpactRows, held: HeldRows, impulses_along):
-    """The impulses (K,) along directions which are those of the slips behind the impact, also as the state varies.
+    """The impulses (K,) with sliding directions equal to those of the slips after the impact, differentiably.
 
-    Two steps of Newton's method from where they are give derivatives of first and second order.
+    Two Newton steps from the given directions give derivatives of first and second order.
     """
     slides = held.slides > 0
 
@@ -105,10 +107,10 @@ def _turn_directions(rows: ImpactRows, held: HeldRows, impulses_along):
 
 
 def rates_behind(rows: ImpactRows, compressed, returned, restitution):
-    """The rates (k,) behind an impact by Poisson's law, without friction: of its two phases, which rows are held.
+    """The rates (k,) after an impact by Poisson's law, without friction, from the held rows of its two phases.
 
-    Compression ends where none moves inwards; each then gives back the part e of its impulse, and more where it would
-    move inwards still (Glocker, §9.4).
+    Compression ends when no contact approaches; each then returns the fraction e of its impulse, and more if it would
+    still approach (Glocker, §9.4).
     """
 
     def phase(rates, held):
@@ -121,11 +123,11 @@ def rates_behind(rows: ImpactRows, compressed, returned, restitution):
 
 
 def construct_impulses(coupling, rates, restitution, coefficients) -> tuple[Any, Any]:
-    """The rate (1,) behind an impact of one contact in a plane, and −F/μΛ (1, 1), by Routh's construction.
+    """The rate (1,) after an impact of one contact in a plane, and −F/μΛ (1, 1), by Routh's construction.
 
-    As the normal impulse Λ grows, friction acts against the slip of that moment. Where that has stopped the contact
-    sticks, if friction suffices, or slides on the other way. Compression ends where the rate is zero, the impact at
-    1 + e times its impulse (Wang & Mason, J. Appl. Mech. 59 (1992) 635).
+    As the normal impulse Λ grows, friction acts against the current slip. When the slip has stopped the contact sticks,
+    if friction suffices, or reverses. Compression ends where the rate is zero, the impact at 1 + e times its impulse
+    (Wang & Mason, J. Appl. Mech. 59 (1992) 635).
     """
     (normal, mixed), (_, tangential) = coupling
     (rate, slip), most = rates, coefficients[0]

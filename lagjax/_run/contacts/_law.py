@@ -1,7 +1,7 @@
-"""The law of impacts on numbers: which contacts push, stick or slide, and by which impulses (see `_impact_law`).
+"""The law of impacts on numbers: which contacts push, stick or slide, and the impulses (see `_impact_law`).
 
 There are k normal rows, then those of the slips, d for each of r contacts; `size` = k + r d. Flags are doubles, 0 or 1.
-Where a loop needs room it takes it from its last argument.
+The last argument of a loop is its scratch memory; results are written into array arguments.
 """
 
 from math import atan2, cos, sin, sqrt
@@ -24,7 +24,7 @@ LINKED = 1e-14  # a coupling, as a fraction of what two contacts respond to thei
 
 @loop
 def drop_dependent(coupling: Floats, held: Floats, size: int, work: Floats):
-    """Let go of the rows `held` (size,) that depend on those before them, by elimination without pivots."""
+    """Set to 0 the flags `held` (size,) of rows that depend on those before them, by elimination without pivoting."""
     for i in range(size * size):
         work[i] = coupling[i]
     for i in range(size):
@@ -41,7 +41,7 @@ def drop_dependent(coupling: Floats, held: Floats, size: int, work: Floats):
 
 @loop
 def solve(matrix: Floats, right: Floats, size: int):
-    """Put the solution of matrix x = right (size,) into `right`, by elimination with pivots of rows."""
+    """Overwrite `right` (size,) with the solution of matrix x = right, by elimination with row pivoting."""
     for i in range(size):
         best = i
         for row in range(i + 1, size):
@@ -69,7 +69,7 @@ def solve(matrix: Floats, right: Floats, size: int):
 def hold_rows(
     k: int, r: int, d: int, rough: Wholes, coupling: Floats, push: Floats, sticks: Floats, held: Floats, work: Floats
 ):
-    """Put 1 for the rows that keep their rates into `held`: of contacts that push, and of slips that stick."""
+    """Write into `held` 1 for the rows with prescribed rates: of contacts that push, and of slips that stick."""
     for i in range(k):
         held[i] = push[i]
     for c in range(r):
@@ -92,7 +92,7 @@ def write_held_system(
     k: int, r: int, d: int, rough: Wholes, coupling: Floats, slides: Floats, direction: Floats, held: Floats,
     matrix: Floats
 ):  # fmt: skip
-    """Put the system of the rows `held` into `matrix`: their rates by impulses with their friction."""
+    """Write into `matrix` the system of the rows `held`: their rates by impulses with their friction."""
     size = k + r * d
     for i in range(size):
         for j in range(size):
@@ -109,9 +109,9 @@ def find_impulses(
     k: int, r: int, d: int, rough: Wholes, mu: Floats, coupling: Floats, rates: Floats, push: Floats, sticks: Floats,
     direction: Floats, targets: Floats, impulses: Floats, work: Floats
 ):  # fmt: skip
-    """Put the impulses (size,) by which rates of contacts that push become `targets` (k,), and slips that stick 0.
+    """Write the impulses (size,) that give pushing contacts the rates `targets` (k,), and sticking slips rate 0.
 
-    In space the directions of slips that slide become those behind the impact, by Newton's method.
+    In space the directions of sliding slips become those after the impact, by Newton's method.
     """
     size, off = k + r * d, 1.0
     held, slides, system = work, work[size:], work[size + r :]
@@ -135,7 +135,7 @@ def turn_directions(
     k: int, r: int, rough: Wholes, coupling: Floats, rates: Floats, slides: Floats, along: Floats, held: Floats,
     impulses: Floats, work: Floats
 ) -> float:  # fmt: skip
-    """Turn the directions (r, 2) of contacts that slide, along which there were `impulses`: one step of Newton's.
+    """Turn the directions (r, 2) of contacts that slide, given the `impulses` along them: one Newton step.
 
     Returns the largest of these angles.
     """
@@ -183,7 +183,7 @@ def turn_directions(
 
 @loop
 def add_rates(rates: Floats, coupling: Floats, impulses: Floats, after: Floats, size: int):
-    """Put the rates behind `impulses` into `after` (size,)."""
+    """Write the rates after `impulses` into `after` (size,)."""
     for i in range(size):
         after[i] = rates[i]
         for j in range(size):
@@ -195,7 +195,7 @@ def find_violations(
     k: int, r: int, d: int, rough: Wholes, mu: Floats, coupling: Floats, rates: Floats, touches: Floats, push: Floats,
     sticks: Floats, direction: Floats, targets: Floats, impulses: Floats, wrong: Floats, work: Floats
 ):  # fmt: skip
-    """Put 1 for the conditions of the law that `impulses` violate into `wrong` (k + r,): of normals, then of slips."""
+    """Write into `wrong` (k + r,) 1 for conditions of the law that `impulses` violate: of normals, then of slips."""
     size, fastest = k + r * d, 0.0
     add_rates(rates, coupling, impulses, work, size)
     for i in range(size):
@@ -214,7 +214,7 @@ def find_violations(
 
 @loop
 def exchange(tableau: Floats, basis: Floats, row: int, enters: int, size: int):
-    """Bring column `enters` into the basis of a tableau in place of what stands in `row`."""
+    """Pivot a tableau: column `enters` replaces the basic variable of `row`."""
     width, pivot = 2 * size + 2, tableau[row * (2 * size + 2) + enters]
     for column in range(width):
         tableau[row * width + column] = tableau[row * width + column] / pivot
@@ -228,7 +228,7 @@ def exchange(tableau: Floats, basis: Floats, row: int, enters: int, size: int):
 
 @loop
 def complement(matrix: Floats, values: Floats, size: int, chosen: Floats, tableau: Floats):
-    """Put 1 for each z that may be positive in w = values + matrix z, w, z ≥ 0, w ⟂ z, into `chosen` (size,).
+    """Write into `chosen` (size,) 1 for each z that may be positive in w = values + matrix z, w, z ≥ 0, w ⟂ z.
 
     By Lemke's pivoting: Cottle, Pang & Stone, *The Linear Complementarity Problem* (1992), algorithm 4.4.5.
     """
@@ -279,7 +279,7 @@ def find_pattern_in_plane(
     k: int, r: int, rough: Wholes, mu: Floats, coupling: Floats, rates: Floats, touches: Floats, targets: Floats,
     push: Floats, sticks: Floats, direction: Floats, work: Floats
 ):  # fmt: skip
-    """Put the pattern of contacts without friction, or in a plane: a linear complementarity problem.
+    """Write the pattern of contacts without friction, or in a plane: a linear complementarity problem.
 
     With N the normal impulses, s⁺ = s_R − s_L and the friction R − μN, it is
 
@@ -321,10 +321,10 @@ def find_pattern_in_space(
     k: int, r: int, d: int, rough: Wholes, mu: Floats, coupling: Floats, rates: Floats, touches: Floats,
     targets: Floats, push: Floats, sticks: Floats, direction: Floats, work: Floats
 ):  # fmt: skip
-    """Put the pattern of contacts in space, by principal pivoting: what its solution violates first is taken back.
+    """Write the pattern of contacts in space, by principal pivoting: the first violated condition is exchanged.
 
-    It begins where all stick; where that goes in circles, as among contacts that depend on each other, where all slide
-    on as they come.
+    It starts with all sticking; if that cycles, as for contacts that depend on each other, with all sliding on as they
+    arrive.
     """
     size = k + r * d
     impulses, wrong, rest = work, work[size:], work[size + k + r :]
@@ -367,7 +367,7 @@ def find_pattern(
     k: int, r: int, d: int, rough: Wholes, mu: Floats, coupling: Floats, rates: Floats, touches: Floats,
     restitution: Floats, push: Floats, sticks: Floats, direction: Floats, work: Floats
 ):  # fmt: skip
-    """Put the pattern of contacts that touch (k,) in an impact by Newton's law; it may violate it, if undecided."""
+    """Write the pattern of touching contacts (k,) in an impact by Newton's law; if undecided, it may violate it."""
     targets, rest = work, work[k:]
     for i in range(k):
         targets[i] = -restitution[i] * rates[i]

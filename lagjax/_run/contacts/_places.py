@@ -1,4 +1,4 @@
-"""The places of what the search for contacts reads and writes, beside those that every search has."""
+"""The fields that the search for contacts reads and writes, in addition to those of every search."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -1,9 +1,9 @@
-"""The replay of a motion with contacts: the same stretches and jumps, with all that was decided given as numbers.
+"""The replay of a motion with contacts: the same stretches and jumps, with all decisions given as numbers.
 
-A row of the record says which watch ended a stretch, which rows the impulses hold and which gaps close. What is left is
-a function of the start, the output times and the parameters that has derivatives of every order:
+A row of the record tells which watch ended a stretch, which rows the impulses hold and which gaps close. The rest is a
+function of the start, the output times and the parameters that has derivatives of every order:
 
-    (t, y) ─► a stretch to the watch ─► impulses of the rows held ─► (t, y) behind them
+    (t, y) ─► a stretch to the watch ─► impulses of the rows held ─► (t, y) after them
 
 Its derivatives are those of the motion that the search found; its values are not used.
 """
@@ -18,16 +18,16 @@ import numpy as np
 
 from lagjax._engine.taylor import Line, Surfaces, move_to_zero, run_stretch
 from lagjax._interface import halves
-from lagjax._primitives import differentiable_where, keep_together
+from lagjax._primitives import differentiable_where, limit_directions
 from lagjax._run.contacts._contact_search import HELD, POISSON
 from lagjax._run.contacts._impact_law import HeldRows, ImpactRows, construct_impulses, find_impulses, rates_behind
 from lagjax._run.jumps import Replay, SceneCode, join
 
 
 class Played(NamedTuple):
-    """The parts that have derivatives: the outputs (T, 2n), of each row its time, velocities and state behind it.
+    """The differentiable results of a replay: outputs (T, 2n); per row its time, velocities and state after it.
 
-    Of an impact its time, impulses and the energy lost; and the end.
+    For an impact its time, impulses and the energy lost; and the end.
     """
 
     path: Any
@@ -56,7 +56,7 @@ class ContactReplay(Replay):
         super().__init__(code, 5)
 
     def __call__(self, *given) -> tuple:
-        """The parts of `Played`, of the output times, the start, the numbers, e and μ."""
+        """The fields of `Played`, from the output times, the start, the numbers, e and μ."""
         path, said, behind, t, y = self.play(*given)
         at, before, t_impact, impulse, lost = jnp.split(said, self._ends[1:5] - 1, axis=1)
         return path, at[:, 0], before, behind, t_impact[:, 0], impulse, lost[:, 0], t, y
@@ -73,7 +73,7 @@ class ContactReplay(Replay):
         _, said, behind, later, shared = jnp.split(ended, self._ends[[0, 5, 6, 7]])
         limits = jnp.append(row.shares, jnp.repeat(row.starts, self.sizes["D"]))
         limits = jnp.where(decides & (limits > 0), limits, jnp.inf)
-        behind = keep_together(behind, shared - still(shared), limits)  # only how they vary matters
+        behind = limit_directions(behind, shared - still(shared), limits)  # only how they vary matters
         last = row.end + jnp.where(decides, row.later_on, 0.0)
         later = later[0] + still(last - later[0])
         path = jnp.where((ahead & (ts <= row.end))[:, None], path[1:-1], 0.0)
@@ -89,10 +89,10 @@ class ContactReplay(Replay):
         return self.line_of_end(self._end_in_parts, (), (2 * n,), (numbers,), (), (2 * n,), (n,), (k,), (r,))
 
     def _end_in_parts(self, record, *given):
-        """The effects of the end of a stretch, all numbers side by side.
+        """The effects of the end of a stretch, concatenated into one vector.
 
-        Whether it varies smoothly; time and velocities; of an impact its time, impulses and the energy lost; the state
-        and the time behind; and what contacts of one instant share (k + r d,).
+        A flag that it varies smoothly; time and velocities; for an impact its time, impulses and the energy lost; the
+        state and the time after it; and the slips that contacts of one instant share (k + r d,).
         """
         *given, t, y, v0, restitution, friction = given
         row, k = self._read(record), self.sizes["K"]
@@ -101,23 +101,22 @@ class ContactReplay(Replay):
         smooth, *moved = move_to_zero(self._find_watches(), row.watch.astype(int), crosses, moving, still)
         ends = zip(moved, moving[:2], strict=True)
         t, y = (jnp.where(stays, start, jnp.where(crosses, *end)) for start, end in zip((t, y), ends, strict=True))
-        rows, vector = self.rows_at(t, y, given[5]), given[5]
+        vector = given[5]
+        response = self._lines["RESPONSE"](self._opened(t, y, vector))
+        rows = ImpactRows.split(response, self.sizes["HEIGHT"], y.size // 2)
         *impact, behind = self._impact_jump((t, y), rows, row, vector, restitution, friction)
         behind, later = jnp.where(decides, behind, y), t + jnp.where(decides, row.later_on, 0.0)
         shared = rows.values[:k], rows.gradients[k:] @ v0
         return join(jnp.where(smooth, 1.0, 0.0), t, halves(y)[1], *impact, behind, later, *shared)
 
-    def rows_at(self, t, y, vector) -> ImpactRows:
-        """The rows of all contacts at a state, with all open."""
-        return ImpactRows.split(self._lines["RESPONSE"](self._opened(t, y, vector)), self.sizes["HEIGHT"], y.size // 2)
-
     def _opened(self, t, y, vector):
+        """The inputs of lines at a state, with all contacts open."""
         k, r, d, doing = (self.sizes[name] for name in ("K", "R", "D", "DOING"))
         ones = jnp.ones(r + r * d)
         return jnp.concatenate([y, t[None], vector, jnp.zeros(k), ones, jnp.zeros(doing - k - ones.size)])
 
     def _impact_jump(self, at, rows: ImpactRows, row, vector, restitution, friction):
-        """The time of an impact, impulses (k,), the energy lost, and the state (2n,) behind a change at (t, y)."""
+        """The time of an impact, impulses (k,), the energy lost, and the state (2n,) after a change at (t, y)."""
         (t, y), k, hits = at, self.sizes["K"], row.hits > 0
         v = halves(y)[1]
         direction = row.direction.reshape(-1, self.sizes["D"])
@@ -141,7 +140,7 @@ class ContactReplay(Replay):
         return t + left, impulses[:k], lost, behind
 
     def _time_left(self, t, y, bounced, ends, vector, restitution):
-        """The time that bounces still take which end at once, by `_contact_search.end_bounces`."""
+        """The remaining time of bounces that end at once, by `_contact_search.end_bounces`."""
         x = self._opened(t, y, vector)
         along = jnp.concatenate([halves(y)[1], self._lines["ACCELERATION"](x), jnp.ones(1)])
         bends, later = jnp.split(self._lines["BENDS"](jnp.concatenate([x, along, jnp.zeros(x.size - along.size)])), 2)

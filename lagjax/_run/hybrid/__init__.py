@@ -1,7 +1,7 @@
 """Motion that changes its laws: modes, each a `System` of its own, and transitions between them.
 
     Hybrid ─► HybridPlan ─► _transition_motion ─► Ending ─► Trajectory
-                             ├─ _transition_search: what happens, by loops over numbers, which _transition_places names
+                             ├─ _transition_search: the events, by loops over numbers, laid out by _transition_places
                              ├─ _transition_replay: the same with derivatives
                              └─ _mode: one mode, its flow, its guards, the resets
 
@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine import Problem
 from lagjax._engine.taylor import MachineCode
@@ -46,7 +47,6 @@ from lagjax._run.hybrid._transition_search import IN_ONE_PLACE
 from lagjax._run.jumps import tolerances_of
 from lagjax._scene import System, present_system, require_system
 
-PyTree = Any
 # The part of a motion below which a time between transitions is none: bounces that pile up come down to the rounding of
 # the time before they are given up, and a reset that leaves a motion on its surface does so behind a longer one.
 SUDDEN = 1e-9
@@ -106,9 +106,9 @@ class Hybrid:
     max_transitions: int = 32
 
     def with_sections(self, functions: tuple, directions: tuple[int, ...], room: int) -> "Hybrid":
-        """The scene with a transition for each section in each mode, after its own, that changes nothing.
+        """The scene with a further transition for each section in each mode, which changes nothing.
 
-        The budget leaves room for `room` crossings of each section, and one more.
+        The budget has room for `room` crossings of each section, and one more.
         """
         notes = [
             Transition(mode, mode, function, way, fires="crossing")
@@ -119,7 +119,7 @@ class Hybrid:
         return Hybrid(self.modes, [*self.transitions, *notes], self.start, more)
 
     def _current_edition(self) -> "Hybrid":
-        """The scene with its functions as they are now: this one, where nothing that they read has changed."""
+        """The scene with the current values that its functions read: this one, if nothing has changed."""
         modes = {name: present_system(mode) for name, mode in self.modes.items()}
         transitions = [transition.now() for transition in self.transitions]
         before, now = [*self.modes.values(), *self.transitions], [*modes.values(), *transitions]
@@ -128,7 +128,7 @@ class Hybrid:
 
     @property
     def first(self) -> Any:
-        """The place of the mode in which it begins, which may be traced."""
+        """The number of the mode in which it begins, which may be traced."""
         return list(self.modes).index(self.start) if isinstance(self.start, str) else self.start
 
     def __repr__(self) -> str:
@@ -170,7 +170,7 @@ def follow_modes(
 
 
 def _raise_unless_ok(modes: dict[str, System], trajectory: Trajectory, layout: Layout, last) -> Trajectory:
-    """The trajectory where it ended well; else `SimulationError`, which names the mode `last` in which it ended."""
+    """The trajectory if it ended well; else `SimulationError`, which names the mode `last` in which it ended."""
     if not is_concrete(trajectory.ok) or trajectory.ok:
         return raise_unless_ok(trajectory, layout, lambda: None)
     name = trajectory.mode_names[int(last)]
@@ -183,7 +183,7 @@ def _raise_unless_ok(modes: dict[str, System], trajectory: Trajectory, layout: L
 
 
 def _explain_stop(trajectory: Trajectory, layout: Layout) -> str | None:
-    """A sentence that says why its transitions ended it; None where the result says it."""
+    """A sentence on why its transitions ended it; None if the result code tells that."""
     changes, names, modes = trajectory.transitions, trajectory.mode_names, trajectory.system
     assert changes is not None and isinstance(modes, dict)
     end, count = trajectory.end, int(changes.count)
@@ -220,7 +220,7 @@ def _last_transitions(trajectory: Trajectory) -> str:
 
 
 def _is_mode(modes: dict[str, System], start: Any) -> bool:
-    """True for the name of a mode or its place, which may be traced."""
+    """True for the name of a mode or its number, which may be traced."""
     if isinstance(start, str):
         return start in modes
     if isinstance(start, bool) or not isinstance(start, int | np.integer | np.ndarray | jax.Array):
@@ -264,17 +264,17 @@ Scene = System | Hybrid
 
 
 def require_scene(scene: Any) -> Scene:
-    """The scene with its functions as they are now. Raises `TypeError` for what is no `System` or `Hybrid`."""
+    """The scene with current values of its functions. Raises `TypeError` for other than `System` or `Hybrid`."""
     return scene._current_edition() if isinstance(scene, Hybrid) else require_system(scene, contacts=True)
 
 
 def jumps(scene: Any) -> bool:
-    """True if the motion of a scene may jump, in rounds of its own: a hybrid one, or one with contacts."""
+    """True if the motion of a scene may jump: a hybrid one, or one with contacts."""
     return isinstance(scene, Hybrid) or scene.touches
 
 
 def first_law(scene: Scene) -> System:
-    """Its `System`, or that of the mode in which it begins: of any mode, where that is traced."""
+    """The `System`, or that of the mode in which a `Hybrid` begins: of any mode, if that is traced."""
     if not isinstance(scene, Hybrid):
         return scene
     return laws(scene)[int(scene.first) if is_concrete(scene.first) else 0]

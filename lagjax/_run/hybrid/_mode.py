@@ -8,7 +8,6 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -23,9 +22,6 @@ from lagjax._primitives import DOUBLE, SINGLE
 from lagjax._program import Unlowerable
 from lagjax._scene import System
 from lagjax._tracing import lower
-
-PyTree = Any
-
 
 FIRES = None, "beyond", "crossing"
 
@@ -104,10 +100,10 @@ class Transition(eqx.Module):
 
 
 class ModeParts:
-    """One mode that is ready to run: its flow, its guards, the transitions that leave it; it is known by identity.
+    """One mode prepared for runs: its flow, its guards, the transitions that leave it; compared by identity.
 
-    `numbers` are the places of these transitions in the list. A reset is None where the state is kept. `reset_lines`
-    and `check`, which is 1 off the constraints, are lines of (q, q̇, t) and the numbers of params.
+    `numbers` are the indices of these transitions in the list. A reset is None if the state is kept. `reset_lines` and
+    `check`, which is 1 off the constraints, are lines of (q, q̇, t) and the numbers of params.
     """
 
     def __init__(
@@ -159,7 +155,7 @@ class ModeParts:
 
 
 def make_mode(name: str, transitions: tuple[Transition, ...], problem: Problem) -> ModeParts:
-    """A mode that is ready to run. Raises `ValueError` where it has no machine code."""
+    """A mode prepared for runs. Raises `ValueError` if it has no machine code."""
     leaving = {k: transition for k, transition in enumerate(transitions) if transition.source == name}
     code, structure = jax.tree.flatten(eqx.filter(problem.params, eqx.is_array_like, inverse=True))
     given = tuple(leaving.values()), tuple(code), structure, tuple(leaving), problem.is_rounded
@@ -185,7 +181,7 @@ def _make_parts(derivation: Derivation, system: System, leaving, code, structure
 
 
 def _guard_surfaces(derivation: Derivation, system: System, leaving: tuple, code: tuple, structure) -> Surfaces | None:
-    """The guards of the transitions that leave a mode, lowered once; None where none leaves."""
+    """The guards of the transitions that leave a mode, lowered once; None if there is no such transition."""
     # `code` and `structure` are what params hold that is not a number. Raises `Unlowerable`.
     if not leaving:
         return None
@@ -207,7 +203,7 @@ def _guard_surfaces(derivation: Derivation, system: System, leaving: tuple, code
 
 
 def state_after(transition: Transition, layout: Layout, t, y, params) -> jax.Array:
-    """The state (2n,) after the reset of a transition. Raises `TypeError` where that is no state of this layout."""
+    """The state (2n,) after the reset of a transition. Raises `TypeError` if it does not have this layout."""
     assert transition.reset is not None
     result = transition.reset(*map(layout.restore, halves(y)), t=t, params=params)
     where = f"The reset from {transition.source!r} to {transition.target!r}"

@@ -1,4 +1,4 @@
-"""The motion of a hybrid scene: a search for what happens, without derivatives, and a replay, which has them.
+"""The motion of a hybrid scene: a search for events, without derivatives, and a replay with derivatives.
 
 HybridPlan, start ─► SceneCode.search ─► Found ─► attach_derivative(HybridReplay) ─► Ending
 """
@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine import Problem
 from lagjax._engine.taylor import Tolerances, vector_of
@@ -23,13 +24,11 @@ from lagjax._run.hybrid._transition_search import LOOPS
 from lagjax._run.jumps import Found, JumpLaw, Mode, SceneCode, mask_rows
 from lagjax._scene import System
 
-PyTree = Any
-
 LAW = JumpLaw(PLACES, LOOPS, ("MODE",), ("LET_OUT", "MODE"))
 
 
 class HybridPlan(eqx.Module):
-    """The constants of a run: the modes by name, their transitions, and what a run may cost."""
+    """The constants of a run: the modes by name, their transitions, tolerances and budgets."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     systems: tuple[System, ...]
@@ -40,7 +39,7 @@ class HybridPlan(eqx.Module):
 
 
 class Ending(NamedTuple):
-    """A motion as a whole: its outputs, where and how it ended, its transitions."""
+    """A whole motion: its outputs, its end, its result, and its transitions."""
 
     end: State
     mode: Any  # its place in `HybridPlan.names`
@@ -53,7 +52,7 @@ class Ending(NamedTuple):
 
 @compile_for_one_call
 def hybrid_motion(plan: HybridPlan, layout: Layout, ts, y0, params: PyTree, start) -> Ending:
-    """The motion from y0 (2n,) at ts[0] in the mode of place `start`, and its `max_transitions` transitions."""
+    """The motion from y0 (2n,) at ts[0] in mode number `start`, with at most `max_transitions` transitions."""
     ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
     replay = replay_of(plan, layout, params, len(ts))
     vector = vector_of(eqx.filter(params, eqx.is_array_like)).astype(float)
@@ -62,10 +61,9 @@ def hybrid_motion(plan: HybridPlan, layout: Layout, ts, y0, params: PyTree, star
 
 
 def follow_known(plan: HybridPlan, layout: Layout, params: PyTree, ts, y0, vectors, start) -> Ending:
-    """The motions of members whose numbers are known, with members in front: `y0` (N, 2n), `ts` (N or 1, T),
-    `vectors` (N, P).
+    """The motions of N members with concrete numbers: `y0` (N, 2n), `ts` (N or 1, T), `vectors` (N, P).
 
-    `params` are those of one member; all begin in the mode of place `start`.
+    `params` are those of one member; all begin in mode number `start`.
     """
     replay, starts = replay_of(plan, layout, params, ts.shape[1]), np.full((len(y0), 1), float(start))
     given = (np.asarray(x, float) for x in (ts, y0, vectors))
@@ -76,7 +74,7 @@ def follow_known(plan: HybridPlan, layout: Layout, params: PyTree, ts, y0, vecto
 def _arrange_outcome(
     plan: HybridPlan, layout: Layout, replay: HybridReplay, found: Found, row, played: PlayedModes, inputs: tuple
 ) -> Ending:
-    """The outputs, transitions and result of a motion, from the parts played; in JAX if `inputs` are given."""
+    """The outputs, transitions and result of a motion, from the replayed parts; in JAX if `inputs` are given."""
     library: Any = jnp if inputs else np
 
     def cut(x):

@@ -18,7 +18,7 @@ from lagjax._run.jumps import Replay, SceneCode, join
 
 
 class PlayedModes(NamedTuple):
-    """The parts that have derivatives: the outputs (T, 2n), of each row its time, the states around it; and the end."""
+    """The differentiable results of a replay: outputs (T, 2n); per row its time, states around it; and the end."""
 
     path: Any
     at: Any
@@ -29,7 +29,7 @@ class PlayedModes(NamedTuple):
 
 
 class HybridReplay(Replay):
-    """The replay of a hybrid scene, of whose modes it has the `parts`."""
+    """The replay of a hybrid scene; `parts` are its modes."""
 
     played = PlayedModes
 
@@ -40,7 +40,7 @@ class HybridReplay(Replay):
         super().__init__(code, 3)
 
     def __call__(self, *given) -> tuple:
-        """The parts of `PlayedModes`, of the output times, the start, the numbers, and the mode in which it begins."""
+        """The fields of `PlayedModes`, from the output times, the start, the numbers, and the mode at the start."""
         path, said, behind, t, y = self.play(*given)
         return path, said[:, 0], said[:, 1:], behind, t, y
 
@@ -74,7 +74,7 @@ class HybridReplay(Replay):
         return self.line_of_end(function, (), (states,), (numbers,), (), (states,))
 
     def _end_in_parts(self, place: int, record, *given):
-        """The effects of the end of a stretch: 1 if it is smooth, the time and state there, the state behind."""
+        """The effects of the end of a stretch: a flag that it is smooth, time and state there, the state after it."""
         parts, row, still, moving, start = self.parts[place], self._read(record), given[:3], given[3:6], given[6:]
         k, crosses, smooth, (t, y, numbers) = row.watch.astype(int), row.crosses > 0, jnp.array(True), moving
         if parts.surfaces is not None:  # one that is not crossed may have no derivative here

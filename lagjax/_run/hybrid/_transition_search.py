@@ -1,7 +1,7 @@
-"""The search for transitions: from stretch to stretch of a hybrid motion, on numbers, without derivatives.
+"""The search for transitions: stretch by stretch of a hybrid motion, on numbers, without derivatives.
 
 A stretch ends at the next zero of a guard of its mode. The first transition of the list whose guard changes there
-happens: its reset, then the other mode. What a guard was just before is remembered (see `_transition_places`).
+happens: its reset, then the new mode. The values of guards just before are remembered (see `_transition_places`).
 """
 
 from math import isfinite, log
@@ -40,7 +40,7 @@ def find_mode(scene: Scene, member: Member) -> int:
 
 @loop
 def start(scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, room: Room):
-    """Begin a member. A place that is no mode, as −1 is, comes with a state that was not reached."""
+    """Initialise a member. A mode number that is no mode, such as −1, comes with a state that was not reached."""
     member.latest = -1.0
     for j in range(scene.k):
         member.let_out[j], member.values[j] = MISSING, MISSING
@@ -53,7 +53,7 @@ def start(scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, r
 
 @loop
 def is_off(scene: Scene, mode: int, x: Floats, room: Room) -> bool:
-    """True if the state at inputs x is off the constraints of a mode."""
+    """True if the state at inputs x violates the constraints of a mode."""
     if scene.checks[mode] == 0:
         return False
     evaluate(scene.checks[mode], x, room.free)
@@ -62,13 +62,13 @@ def is_off(scene: Scene, mode: int, x: Floats, room: Room) -> bool:
 
 @loop
 def clear(rate: float, rounding: float, largest: float) -> float:
-    """A rate, 0 where its rounding, or the `largest` one so far, decides it."""
+    """The rate, or 0 if it is below its rounding, or below the `largest` rounding so far."""
     return rate if abs(rate) > max(rounding, largest) else 0.0
 
 
 @loop
 def reset(scene: Scene, member: Member, j: int, x: Floats, after: Floats):
-    """Put the inputs behind transition j from inputs x."""
+    """Write into `after` the inputs after transition j, from inputs x."""
     copy(x, after, scene.inputs)
     if scene.resets[j] != 0:
         evaluate(scene.resets[j], x, after)
@@ -79,7 +79,7 @@ def reset(scene: Scene, member: Member, j: int, x: Floats, after: Floats):
 
 @loop
 def prepare(scene: Scene, member: Member, ts: Floats, times: Floats, y: Floats, numbers: Floats, room: Room):
-    """Put the run of a member's next stretch: its times (T + 2,), its start, and its numbers with the sides."""
+    """Write the run of a member's next stretch: its times (T + 2,), its start, and its numbers with the sides."""
     mode, x, n = find_mode(scene, member), member.x, scene.n
     count, first = scene.counts[mode], scene.first_of[mode]
     note_rounding(scene, member, mode, room)
@@ -94,9 +94,9 @@ def prepare(scene: Scene, member: Member, ts: Floats, times: Floats, y: Floats, 
 
 @loop
 def note_rounding(scene: Scene, member: Member, mode: int, room: Room):
-    """Note the rounding of the guards where a stretch begins: of its mode, and of other modes.
+    """Record the rounding of the guards at the start of a stretch: of its mode, and of other modes.
 
-    A guard of another mode may be the same function. What is computed with that mode's equations says nothing here.
+    A guard of another mode may be the same function. Quantities of that mode's equations are left out.
     """
     for of in range(scene.modes):
         count, first, watches = scene.counts[of], scene.first_of[of], room.other
@@ -114,7 +114,7 @@ def note_rounding(scene: Scene, member: Member, mode: int, room: Room):
 
 @loop
 def write_side(scene: Scene, member: Member, mode: int, g: int, room: Room):
-    """Put the side of guard g where a motion begins in this mode; for one that is beyond zero see `Transition`."""
+    """Write the side of guard g where a stretch starts in this mode; for one beyond zero see `Transition`."""
     total, j, guards = scene.counts[mode], scene.first_of[mode] + g, member.guards
     value, way, rounding = guards[g], float(scene.way[j]), member.rounding[j]
     rate = clear(guards[total + g], guards[4 * total + g], member.rate_rounding[j])
@@ -140,7 +140,7 @@ def write_side(scene: Scene, member: Member, mode: int, g: int, room: Room):
 
 @loop
 def turns_round(scene: Scene, member: Member, mode: int, g: int, rate: float, room: Room) -> bool:
-    """True for a guard whose reset keeps it off its surface: turns it round, or puts it back.
+    """True for a guard whose reset keeps it off its surface: it reverses its rate, or puts it back.
 
     A kick after which it continues does not, nor does a section without a reset.
     """
@@ -163,9 +163,9 @@ def finish(
     scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, record: Entry, found: Floats, y_end: Floats,
     t_end: float, changes: Floats, event: int, result: int, accepted: float, rejected: float, room: Room
 ):  # fmt: skip
-    """Take a stretch, its outputs `found` (T + 2, 2n) and its end: the mode behind it, and a row of the record.
+    """Process a stretch, with outputs `found` (T + 2, 2n) and its end: the new mode, and a row of the record.
 
-    `changes` say which guards fell or rose, if it is an `event`; `result` is that of a run without one.
+    `changes` tell which guards fell or rose, if it is an `event`; `result` is that of a run without one.
     """
     n, x, mode, fell, k = scene.n, member.x, find_mode(scene, member), room.fell, -1
     row, begun, first = record[int(member.rounds) * scene.row :], x[2 * n], scene.first_of[mode]
@@ -208,9 +208,9 @@ def finish(
 def pass_transition(
     scene: Scene, member: Member, mode: int, k: int, turns: bool, result: int, row: Entry, room: Room
 ) -> int:
-    """The result behind guard k, whose transition happens (none if k is −1), from which the member continues.
+    """The result after guard k fired (none if k is −1): apply its transition to the member.
 
-    Where that `turns` a guard at once, against its rate, the motion that does so is lost in rounding.
+    If a transition `turns` a guard at once, against its rate, repetition shows a motion lost in rounding.
     """
     n, x, after, total = scene.n, member.x, room.after, scene.counts[mode]
     j, fell, watched, sound, against = scene.first_of[mode] + k, room.fell, room.watched, True, False
@@ -247,7 +247,7 @@ def pass_transition(
 
 @loop
 def note_sides(scene: Scene, member: Member, mode: int, room: Room):
-    """Note the sides before a reset of the guards of this mode, and their rounding; of others nothing is known.
+    """Record the sides before a reset of the guards of this mode, and their rounding; others are unknown.
 
     Guards that fired: the side they left. Guards on their surface: the side they started on if they have stayed or have
     no rate; otherwise the side opposite to their rate.
@@ -272,9 +272,9 @@ def note_sides(scene: Scene, member: Member, mode: int, room: Room):
 
 @loop
 def has_orders(scene: Scene, member: Member, mode: int, room: Room) -> bool:
-    """True if blows of guards that are there lead elsewhere when the list is read from its end.
+    """True if the guards at zero have blows whose result differs when the list is applied in reverse order.
 
-    Blows lead back into their own mode, with a direction and a reset.
+    Blows are transitions into their own mode, with a direction and a reset.
     """
     first, there, blows = scene.first_of[mode], room.there, 0
     for g in range(scene.counts[mode]):
@@ -329,7 +329,7 @@ def follow_blows(scene: Scene, member: Member, mode: int, backwards: bool, x: Fl
 
 @loop
 def name_end(scene: Scene, record: Entry, end: float) -> int:
-    """The result of a motion that has spent its budget of transitions before `end`."""
+    """The result of a motion that has used up its budget of transitions before `end`."""
     if go_in_turn(scene, record):
         return IN_TURN
     return ZENO if pile_up(scene, record, end) else TOO_MANY
@@ -337,11 +337,11 @@ def name_end(scene: Scene, record: Entry, end: float) -> int:
 
 @loop
 def pile_up(scene: Scene, record: Entry, end: float) -> bool:
-    """True if the times of a spent budget of transitions run geometrically to a limit before `end`.
+    """True if the times of a used-up budget of transitions converge geometrically to a limit before `end`.
 
     Aitken's extrapolation of the last times, taken far enough apart that a pattern of two, three or six transitions (a
     flight and a contact, say) repeats in between: three intervals whose two ratios agree, and are below one. Or the
-    time does not move any more. One interval alone may be that of two transitions at the same instant.
+    time does not increase any more. One interval alone may be that of two transitions at the same instant.
     """
     size = scene.most - 1
     apart = 6 if size > 18 else (2 if size > 6 else 1)
@@ -359,7 +359,7 @@ def pile_up(scene: Scene, record: Entry, end: float) -> bool:
 
 @loop
 def go_in_turn(scene: Scene, record: Entry) -> bool:
-    """True if the last transitions of a spent budget, of several kinds, are at one instant to which none pile up."""
+    """True if the last transitions of a used-up budget, of several kinds, are at one instant without convergence."""
     size, several, before = scene.most - 1, False, -INFINITY
     if size < IN_ONE_PLACE:
         return False

@@ -1,9 +1,10 @@
-"""Motions that jump: a search for what happens, over numbers, and a replay, which has derivatives; for any law.
+"""Motions that jump: a search for events, over numbers, and a replay with derivatives; for any law.
 
-    a law ─► _field_places (the fields of what it reads and writes) ─► _driver (its loop over members and stretches)
+    a law ─► _field_places (the fields that it reads and writes) ─► _driver (its loop over members and stretches)
           ─► _scene_code (a scene by addresses, its runs) ─► _round_replay (the same with derivatives)
 
-`contacts/` and `hybrid/` have the laws.
+A *law* is the pair of loops and fields that decides what happens at the end of a stretch: those of `contacts/` and
+`hybrid/`.
 """
 
 from lagjax._run.jumps._driver import GOING, LEAST, bind_law, bind_loops, copy, find_sign

@@ -1,11 +1,11 @@
-"""The loops of every search, whatever its law: members side by side, from stretch to stretch.
+"""The loops of every search, for any law: members side by side, stretch by stretch.
 
-    follow ─► start ─► prepare: sides and rounding of all watches ─► the kernel ─► finish: what happens there, a row
+    follow ─► start ─► prepare: sides and rounding of all watches ─► the kernel ─► finish: the event, a row
                           ▲                                                           │
                           └───────────────────────────────────────────────────────────┘
 
-A law declares its places, and gives the loops `start`, `prepare`, `finish` and `find_mode` (`bind_law`). A flag is
-0 or 1. `work` is scratch memory.
+A law declares its fields, and provides the loops `start`, `prepare`, `finish` and `find_mode` (`bind_law`). A flag is 0
+or 1. `work` is scratch memory.
 """
 
 from math import isfinite
@@ -27,20 +27,20 @@ LEAST = 1e-300  # a side that is exactly zero still has a sign
 
 @loop
 def copy(given: Floats, into: Floats, count: int):
-    """Put the first `count` numbers of one array into another."""
+    """Copy the first `count` numbers of array `given` into array `into`."""
     for i in range(count):
         into[i] = given[i]
 
 
 @loop
 def find_sign(x: float) -> float:
-    """1, −1, or 0."""
+    """The sign of x: 1, −1, or 0."""
     return 1.0 if x > 0 else (-1.0 if x < 0 else 0.0)
 
 
 @loop
 def watch(scene: Scene, member: Member, x: Floats, mode: int, out: Floats, work: Floats):
-    """Put the watches at inputs x, G each: values, rates, how far rounding moves a value, that of time, and a rate."""
+    """Write the watches at inputs x, G each: values, rates, roundings of a value, of it by time, and of a rate."""
     n, total = scene.n, scene.counts[mode]
     evaluate(scene.watch[mode], x, work)
     evaluate(scene.errors[mode], x, work[4 * total :])
@@ -65,13 +65,13 @@ def watch(scene: Scene, member: Member, x: Floats, mode: int, out: Floats, work:
 
 @loop
 def is_ahead(output: float, t: float, first: float) -> bool:
-    """True for an output time that a stretch from t on may cover; at the first time all that are there."""
+    """True for an output time that a stretch from t on may cover; at the first time all that equal it."""
     return output > t or (output == t and t == first)
 
 
 @loop
 def write_times(scene: Scene, t: float, ts: Floats, times: Floats):
-    """Put the times (T + 2,) of a stretch from t on: where it begins, its outputs, and the last one."""
+    """Write the times (T + 2,) of a stretch from t on: its start, its outputs, and the last one."""
     times[0], times[scene.times + 1] = t, ts[scene.times - 1]
     for j in range(scene.times):
         times[1 + j] = ts[j] if is_ahead(ts[j], t, ts[0]) else t
@@ -81,7 +81,7 @@ def write_times(scene: Scene, t: float, ts: Floats, times: Floats):
 def write_outputs(
     scene: Scene, ts: Floats, begun: float, end: float, found: Floats, doing: Floats, path: Floats, did: Floats
 ):
-    """Put the outputs of a stretch, `found` (T, 2n), and what the motion is `doing` then."""
+    """Write the outputs of a stretch, `found` (T, 2n), and the contact states or mode (`doing`) then."""
     states = 2 * scene.n
     for j in range(scene.times):
         if is_ahead(ts[j], begun, ts[0]) and ts[j] <= end:
@@ -93,10 +93,10 @@ def write_outputs(
 def follow(
     scene: Scene, members: int, ts: Floats, path: Floats, did: Floats, record: Entry, memory: Member, room: Room
 ):
-    """Follow members to their ends, or to a stretch that the kernel does not finish (`ASKS`).
+    """Integrate members to their ends, or to a stretch that the kernel does not finish (`ASKS`).
 
-    `ts` (T,) are the same for all if `scene` has one row of them, or (members, T). Members run side by side: those
-    that are going are packed for one call of the kernel, those of each mode apart.
+    `ts` (T,) are the same for all if `scene` has one row of them, or (members, T). Members run side by side: the active
+    ones are packed for one call of the kernel, those of each mode separately.
     """
     size, times, states = scene.memory, scene.times, 2 * scene.n
     for m in range(members):
@@ -126,7 +126,7 @@ def follow_stretch(
     scene: Scene, mode: int, count: int, ts: Floats, path: Floats, did: Floats, record: Entry, memory: Member,
     room: Room
 ):  # fmt: skip
-    """Follow a stretch of `count` members, whose numbers are in `ORDER`, by one call of the kernel."""
+    """Integrate a stretch of `count` members, whose numbers are in `ORDER`, in one call of the kernel."""
     size, times, states = scene.memory, scene.times, 2 * scene.n
     outputs, each = times + 2, scene.room * scene.row
     numbers = scene.inputs - states - 1 + 2 * scene.counts[mode]
@@ -170,13 +170,13 @@ def follow_stretch(
 
 
 def bind_loops(names: dict[str, Any]) -> tuple[Loop, ...]:
-    """`watch`, `write_times` and `write_outputs` for the places of a law, whose module has these `names`."""
+    """The loops `watch`, `write_times` and `write_outputs` for the fields of a law, from its module's `names`."""
     given = {name: names[name] for name in ("Scene", "Member")}
     return tuple(of.bind(**given) for of in (watch, write_times, write_outputs))
 
 
 def bind_law(names: dict[str, Any]) -> tuple[Loop, ...]:
-    """`follow`, `prepare`, `finish` and `find_mode` of a law, whose module has these `names`."""
+    """The loops `follow`, `prepare`, `finish` and `find_mode` of a law, from its module's `names`."""
     known = "Scene", "Member", "Entry", "Room", "__name__", "start", "prepare", "finish", "find_mode"
     given = {name: names[name] for name in known}
     whole = follow.bind(**given, follow_stretch=follow_stretch.bind(**given))

@@ -1,7 +1,7 @@
-"""The places of what a search reads and writes: in its scene, a member's memory, a row of its record, a thread's room.
+"""The offsets of all fields of a search: in its scene, a member's memory, a record row, a thread's scratch.
 
-A scene is a row of integers: first those that are named, then arrays. Of memories, records and rooms it holds at which
-double each field begins. A law declares its own fields after those that all have.
+A scene is a row of integers: first named ones, then arrays. For memories, records and scratch it has the offset of each
+field in doubles. A law declares its own fields after the common ones.
 """
 
 from types import SimpleNamespace
@@ -48,9 +48,9 @@ RECORD = {
 
 
 class Places:
-    """The places of a law, whose fields stand in dictionaries like those above; of `work` the last is FREE.
+    """The field offsets of a law, whose fields are given in dictionaries like those above; the last of `work` is FREE.
 
-    Of a row of the record `said` is what a user is told.
+    The fields `said` of a row are those that the user's results contain.
     """
 
     def __init__(self, sizes: tuple, arrays: tuple, memory: dict, work: dict, said: dict, record: dict):
@@ -76,12 +76,12 @@ class Places:
         return Struct(places, _lower_case(name for name in fields if not fields[name]), "scene")
 
     def count_doubles(self, sizes: dict[str, int]) -> dict[str, int]:
-        """The count of doubles in each field of a memory, of the room of a thread and of a row."""
+        """The number of doubles in each field of a memory, of the scratch memory of a thread and of a row."""
         known = {name.lower(): size for name, size in sizes.items()}
         return {name: eval(count or "1", {}, known) for name, count in self.fields.items()}
 
     def write_scene(self, sizes: dict[str, int], arrays: dict[str, np.ndarray], fields: dict[str, int]) -> np.ndarray:
-        """The row of integers, without addresses; `fields` are the doubles of each field."""
+        """The row of integers, without addresses; `fields` are the sizes of all fields in doubles."""
         scene = np.zeros(len(self.names) + sum(np.size(x) for x in arrays.values()), np.int64)
         for name, size in sizes.items():
             scene[self.of[name]] = size

@@ -1,9 +1,9 @@
-"""The replay of a motion that jumps: the same stretches and jumps, with all that was decided given as numbers.
+"""The replay of a motion that jumps: the same stretches and jumps, with all decisions given as numbers.
 
-A row of the record says which watch ended a stretch, and what happens there. What is left is a function of the start,
+A row of the record tells which watch ended a stretch, and which event followed. The rest is a function of the start,
 the output times and the parameters that has derivatives of every order:
 
-    (t, y) ─► a stretch to the watch ─► what happens there ─► (t, y) behind it
+    (t, y) ─► a stretch to the watch ─► the event there ─► (t, y) after it
 
 Its derivatives are those of the motion that the search found; its values are not used.
 """
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine.taylor import Line
-from lagjax._primitives import Repetition, attach_derivative, differentiable_where, lost_unless
+from lagjax._primitives import Repetition, attach_derivative, differentiable_where, undefined_unless
 from lagjax._program import Unlowerable
 from lagjax._run.jumps._scene_code import Found, SceneCode
 from lagjax._tracing import lower
@@ -27,9 +27,9 @@ LONGEST_REPLAYED = 5000
 
 
 def mask_rows(there, x, inputs: tuple):
-    """The numbers of rows, NaN where these are not `there`; and so is what varies with `inputs`, if it is traced."""
+    """The rows x, NaN where the flag `there` is false; with traced `inputs`, derivatives by these are NaN too."""
     there = there[(..., *[None] * (x.ndim - there.ndim))]
-    return lost_unless(there, x, inputs) if inputs else np.where(there, x, np.nan)
+    return undefined_unless(there, x, inputs) if inputs else np.where(there, x, np.nan)
 
 
 def join(*arrays):
@@ -37,10 +37,11 @@ def join(*arrays):
 
 
 class Replay:
-    """The replay of a scene, whose search is `code`; it is known by identity.
+    """The replay of a scene, whose search is `code`; compared by identity.
 
-    A law passes a stretch (`pass_stretch`), and says how many numbers it tells of one, in addition to the state after
-    it. Its `played` are the parts of a motion that have derivatives: the path, fields of rows, and t and y at the end.
+    A law implements a stretch (`pass_stretch`), and `said`, the number of values that it returns for one in addition to
+    the state after it. `played` is the type of its differentiable results: path, fields of rows, and t and y at the
+    end.
     """
 
     said: int  # how many numbers a law tells of a stretch
@@ -53,17 +54,17 @@ class Replay:
         self._rounds = Repetition(self._play_round, varying, 2, *shapes)
 
     def __call__(self, *given) -> tuple:
-        """The parts of `played`, of what a search is given."""
+        """The fields of `played`, from the arguments of a search."""
         raise NotImplementedError
 
     def follow(self, *given) -> tuple[Found, Any, Any]:
-        """The findings of a search, the rows of its record, and what was played, which has derivatives."""
+        """The findings of a search, the rows of its record, and the replayed results, which have derivatives."""
         found = self.code.search(*jax.lax.stop_gradient(given))
         row, played = self.read(found)
         return found, row, type(played)(*attach_derivative(self, tuple(played), *given))
 
     def read(self, found: Found) -> tuple[Any, Any]:
-        """The rows of a record, and what was played, without derivatives."""
+        """The rows of a record, and the results as in a replay, without derivatives."""
         code, states = self.code, 2 * self.sizes["N"]
         said = code.law.places.said
         row = code.read(found.record[..., : code.width(said)], said)
@@ -71,17 +72,17 @@ class Replay:
         return row, self.played(found.path, *parts, found.ending[..., 0], found.ending[..., 1 : states + 1])
 
     def pass_stretch(self, given: tuple, start: tuple, row, record, ahead, times, event) -> tuple:
-        """The outputs (T, 2n), zero where there are none; what is said, the state behind it, and the time then.
+        """The outputs (T, 2n), zero where there are none; the values `said`, the state after it, and the time then.
 
         A stretch begins at `start`, (t, y), and has these `times` (T + 2,), of which outputs lie `ahead`. Its `event`
-        are the time and the state where it ends, the watch that is zero there, and whether it crosses.
+        are the time and the state at its end, the watch that is zero there, and a flag that it crosses.
         """
         raise NotImplementedError
 
     def play(self, ts, y0, *given) -> tuple:
-        """The path (T, 2n), what is said of each round, (N, …), the states behind them, and t and y at the end.
+        """The path (T, 2n), the values said of each round, (N, …), the states after them, and t and y at the end.
 
-        What is `given` last and does not vary is for the search alone.
+        Arguments `given` last that have no derivatives are for the search only.
         """
         found = self.code.search(*jax.lax.stop_gradient((ts, y0, *given)), is_replayed=True)
         begun = self.code.read_ending(found.ending).begun
@@ -90,7 +91,9 @@ class Replay:
         before = (ts <= begun[-1]) & ((begun[-1] > ts[0]) | (count == 0))  # one at the start is the first round's
         path, varying = jnp.where(before[:, None], y, 0.0), (ts, y0, *given)[: self._rounds.inputs]
         (t, y), (said, behind), (more,) = self._rounds(varying, (t, y), (found.record,), count)
-        known = (ts > ts[0]) | (count == 0) | (t > ts[0])  # no round gives outputs at a start that is an end
+        # No round gives outputs at a start that is an end. The time is that of the search: with it nothing asks for the
+        # values of the rounds where only their derivatives are wanted, and these are not played for them.
+        known = (ts > ts[0]) | (count == 0) | (found.ending[0] > ts[0])
         return differentiable_where(known[:, None], path + more), said, behind, t, y
 
     def _read(self, record):
@@ -110,9 +113,9 @@ class Replay:
         return [later, behind], [said, behind], [path]
 
     def line_of_end(self, function: Callable, *shapes: tuple[int, ...]) -> Line | None:
-        """The end of a stretch as one straight line if that is not long.
+        """The effects of the end of a stretch as one straight line, if that is not long; else None.
 
-        Its `function` is of a record, the time, state and numbers of the end, which do not vary, and of these `shapes`.
+        Its `function` takes a record, the time, state and numbers of the end, without derivatives, and these `shapes`.
         """
         record = self.code.width(self.code.law.places.record)
         fixed = [(record,), (), (2 * self.sizes["N"],), (self.sizes["NUMBERS"],)]

@@ -1,4 +1,4 @@
-"""A scene as its search takes it: machine code by address, sizes, and the places of numbers; its runs.
+"""A scene in the form that a search takes: addresses of machine code, sizes, field offsets; and its runs.
 
 SceneCode.search(ts, y0, numbers, …) ─► search_p ─► rows of NumPy ─► `_driver.follow` by a law ─► Found
                                           └─ a stretch that the kernel gives up: `Flow.run`
@@ -31,9 +31,9 @@ _ROUNDS = 10**6  # of a kernel, for a stretch: beyond that it continues on the h
 
 
 def tolerances_of(problem: Problem, scene: str, what: str) -> Tolerances:
-    """rtol and atol of a motion that jumps. Raises `ValueError` if they are traced, or the motion goes back in time.
+    """rtol and atol of a motion that jumps. Raises `ValueError` if they are traced, or the motion runs backward.
 
-    The errors name the `scene`, and `what` cannot be undone.
+    The error names the `scene`, and `what`, which cannot be reversed.
     """
     if not all(map(is_concrete, problem.tolerances)):
         raise ValueError(f"rtol and atol of {scene} must be numbers: they decide the order of the method.")
@@ -44,9 +44,9 @@ def tolerances_of(problem: Problem, scene: str, what: str) -> Tolerances:
 
 
 class JumpLaw(NamedTuple):
-    """A law of what happens where a watch falls: `loops` over numbers at `places`.
+    """A law of events at the end of stretches: compiled `loops`, and the fields `places` that they use.
 
-    A search is `given` fields of a member's memory in addition to the state, and tells those of its `ending`.
+    `given` are the fields of a member's memory that a search takes in addition to the state, `ending` those it returns.
     """
 
     places: Places
@@ -56,7 +56,7 @@ class JumpLaw(NamedTuple):
 
 
 class Mode(NamedTuple):
-    """A mode: its flow, its `count` watches, and more lines by their names in a scene; each made where it is needed."""
+    """A mode: its flow, its `count` watches, and further lines by their names in a scene; each made on first use."""
 
     make: Callable
     count: int
@@ -65,11 +65,11 @@ class Mode(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The findings of a search, of one member or with members in front.
+    """The findings of a search, for one member or with a member axis first.
 
-    The outputs `path` (T, 2n), what it `did` there (T, …), −1 where the motion did not come, the `record` (N, …), whose
-    rows `Places` declares, and the `ending`: t and y, result, rounds, accepted and rejected steps, what the law tells
-    there, and y and t where it began.
+    The outputs `path` (T, 2n), the contact states or modes `did` there (T, …), −1 at times not reached, the `record`
+    (N, …), whose rows `Places` declares, and the `ending`: t and y, result, rounds, accepted and rejected steps, fields
+    of the law, and y and t of the start.
     """
 
     path: Any
@@ -82,9 +82,9 @@ ENDING = "RESULT", "ROUNDS", "ACCEPTED", "REJECTED"
 
 
 class SceneCode:
-    """The machine code of a scene of these `sizes` and `arrays` (see `Places`); it is known by identity.
+    """The machine code of a scene of these `sizes` and `arrays` (see `Places`); compared by identity.
 
-    `lines` by their names in a scene do not depend on the mode. Watches of the `first` modes are made at once.
+    `lines` by their names in a scene do not depend on the mode. Watches of the `first` modes are compiled at once.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class SceneCode:
         self.scene = functools.cache(self._scene_row)
 
     def _scene_row(self, many: bool) -> np.ndarray:
-        """The row of integers that the search takes, without what modes need; for one member, or for many."""
+        """The row of integers that the search takes, without those of modes; for one member, or for many."""
         places = self.law.places
         scene = places.write_scene(self.sizes, self.arrays, self.fields)
         scene[places.at.BEGIN] = ctypes.cast(handler().begin, ctypes.c_void_p).value or 0
@@ -126,7 +126,7 @@ class SceneCode:
         self._add_codes(scene, lines)
 
     def add_mode(self, scene: np.ndarray, mode: int, many: bool) -> None:
-        """Add to a scene what a mode needs."""
+        """Add to a scene the addresses and sizes of a mode."""
         at = self.law.places.at
         if mode >= self._first and (surfaces := self.modes[mode].find_surfaces()) is not None:
             self._add_watches(scene, mode, surfaces)
@@ -147,11 +147,11 @@ class SceneCode:
             scene[place] = address
 
     def width(self, names: Collection[str]) -> int:
-        """The count of doubles of these fields."""
+        """The number of doubles in these fields."""
         return sum(self.fields[name] for name in names)
 
     def read(self, rows, names: Collection[str]) -> Any:
-        """The fields of rows (…, doubles) by their names in small letters, those of one double without an axis."""
+        """The fields of rows (…, doubles) as attributes in small letters, those of one double without an axis."""
         ends = np.cumsum([self.fields[name] for name in names])
         parts = [rows[..., end - self.fields[name] : end] for name, end in zip(names, ends, strict=True)]
         of = collections.namedtuple("Rows", [name.lower() for name in names])
@@ -159,22 +159,22 @@ class SceneCode:
         return of(*(x if counts[name] else x[..., 0] for name, x in zip(names, parts, strict=True)))
 
     def read_ending(self, ending) -> Any:
-        """The fields of the `ending` of a search, but for t and y in front."""
+        """The fields of the `ending` of a search after t and y."""
         return self.read(ending[..., 2 * self.sizes["N"] + 1 :], (*ENDING, *self.law.ending, "BEGUN"))
 
     # ---- runs ----
 
     def search(self, ts, y0, numbers, *given, is_replayed: bool = False) -> Found:
-        """The motion from `y0` (2n,) on, at `ts` (T,) with `numbers` (P,), and what else is `given`: no derivatives.
+        """The motion from `y0` (2n,), at `ts` (T,), with `numbers` (P,) and fields `given`; it has no derivatives.
 
-        Rows of the record are whole where it `is_replayed`, else they have what is `said`.
+        Rows of the record are complete if it `is_replayed`, else they have the fields `said`.
         """
         given = map(jnp.asarray, (ts, y0, numbers, *given))
         places = self.law.places
         return Found(*search_p.bind(*given, code=self, names=tuple(places.record if is_replayed else places.said)))
 
     def run(self, ts, y0, numbers, *given, room: int | None) -> Found:
-        """`search` on arrays of NumPy with members in front; with no `room` its records are as long as the longest."""
+        """As `search`, on NumPy arrays with a member axis first; without `room` records have the longest length."""
         members, scene, states = len(y0), self.scene(len(y0) > 1).copy(), 2 * self.sizes["N"]
         memory, at = np.zeros((members, scene[self.law.places.at.MEMORY])), self.law.places.of
         first = np.broadcast_to(ts[:, :1], (members, 1))
@@ -199,7 +199,7 @@ class SceneCode:
 
 
 def _call_numpy(line: Line) -> tuple[Any, int]:
-    """A function that evaluates a line by NumPy, called as machine code is, and its address: for tables."""
+    """A C-callable function that evaluates a line by NumPy, and its address: for lines with tables."""
 
     def evaluate(x: int, out: int, *_: int) -> None:
         given, found = (
@@ -215,7 +215,7 @@ def _call_numpy(line: Line) -> tuple[Any, int]:
 
 
 class _BatchRun:
-    """A run of members, followed until all have ended."""
+    """A run of members, integrated until all have ended."""
 
     def __init__(self, code: SceneCode, scene, ts, memory, path, did, room: int | None):
         self.code, self.scene, self.ts, self.memory, self.path, self.did = code, scene, ts, memory, path, did
@@ -226,7 +226,7 @@ class _BatchRun:
         self.results = memory[:, scene[at.RESULT]]
 
     def follow(self) -> None:
-        """Follow all to their ends."""
+        """Integrate all members to their ends."""
         members = len(self.memory)
         together = min(_TOGETHER, max(1, -(-members // cores())))
         places = [slice(begin, begin + together) for begin in range(0, members, together)]
@@ -263,7 +263,7 @@ class _BatchRun:
         self._loops[0](scene.ctypes.data, len(memory), *(x.ctypes.data for x in arrays))
 
     def _answer_requests(self, asking: list[int]) -> None:
-        """Make the modes that members ask for, or follow stretches that the kernel did not finish."""
+        """Compile the modes that members request, or finish stretches that the kernel did not finish."""
         code, at, many = self.code, self.at, len(self.memory) > 1
         known = self.scene.copy()
         for member in asking:
@@ -279,7 +279,7 @@ class _BatchRun:
             self.results[member] = GOING
 
     def _continue_stretch(self, member: int, mode: int) -> None:
-        """Follow a stretch that the kernel did not finish."""
+        """Finish a stretch that the kernel did not finish."""
         code, scene, memory, at, loops = self.code, self.scene, self.memory[member], self.at, self._loops
         states, ts = 2 * scene[at.N], self.ts[member if scene[at.STRIDE] else 0]
         times, y, work = np.zeros(ts.size + 2), np.zeros(states), np.zeros(scene[at.ORDER])

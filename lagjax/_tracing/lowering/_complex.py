@@ -1,8 +1,8 @@
 """Complex numbers on scalars: each is a pair of real ones, its real and its imaginary part.
 
-A pair has an id of its own (`Expansion.pair`), so that what only moves numbers moves pairs as well. What computes takes
-them apart: a function of z = x + iy becomes two of x and y. Logarithms, roots and powers have their branch cut on the
-negative real axis, as in JAX: it is that of atan2, a border.
+A pair has an id of its own (`Expansion.pair`), so that primitives that only move numbers move pairs too. Arithmetic
+splits them: a function of z = x + iy becomes two of x and y. Logarithms, roots and powers have their branch cut on the
+negative real axis, as in JAX: it is that of atan2, and a border.
 
 Fourier transforms and inverse circular and hyperbolic functions are left to XLA.
 """
@@ -18,7 +18,7 @@ from lagjax._tracing.lowering._rules import COMPLEX, Expansion, lowers, reductio
 
 
 class Pair(NamedTuple):
-    """Complex numbers by their parts, arrays of scalars."""
+    """Complex numbers as two arrays of scalars: real and imaginary parts."""
 
     re: Scalars
     im: Scalars
@@ -42,7 +42,7 @@ class Pair(NamedTuple):
 
     @property
     def square(self) -> Scalars:
-        """|z|²."""
+        """The squared modulus |z|²."""
         return self.re * self.re if self.is_real else self.re * self.re + self.im * self.im
 
     @property
@@ -92,7 +92,7 @@ def _absolute(z: Pair) -> Scalars:
 
 
 def _sign(z: Pair) -> Pair:
-    """z/|z|, and 0 at 0."""
+    """The complex sign z/|z|, and 0 at z = 0."""
     square = z.square
     is_zero = _real("eq", square, 0.0)
     size = _real("sqrt", is_zero.map("select", is_zero, square, 1.0))
@@ -104,7 +104,7 @@ def _square_root(z: Pair) -> Pair:
 
 
 def _whole_power(z: Pair, exponent: int) -> Pair:
-    """A whole power by repeated squaring; of a negative exponent the inverse."""
+    """z**exponent for a whole exponent, by repeated squaring; the inverse for a negative one."""
     result, base, left = None, z, abs(exponent)
     while left:
         if left & 1:
@@ -117,7 +117,7 @@ def _whole_power(z: Pair, exponent: int) -> Pair:
 
 
 def _power(z: Pair, exponent: Pair) -> Pair:
-    """|z|ᶜ e^(−d θ), turned by c θ + d log |z|, for an exponent c + id and z with the argument θ."""
+    """The power with modulus |z|ᶜ e^(−d θ) and angle c θ + d log |z|, for the exponent c + id, θ the angle of z."""
     graph = z.re.expansion.graph
     values = {graph.value(i) for i in exponent.re.ids.ravel().tolist()} if exponent.is_real else {None}
     value = values.pop() if len(values) == 1 else None
@@ -144,14 +144,14 @@ def _cosine(z: Pair) -> Pair:
 
 
 def _tangent(z: Pair) -> Pair:
-    """tan x sech² y/(1 + tan² x tanh² y) and tanh y sec² x/(1 + …), written so that nothing overflows."""
+    """tan z = tan x sech² y/(1 + tan² x tanh² y) + i tanh y sec² x/(1 + …), written so that nothing overflows."""
     sine, cosine, ratio = _real("sin", z.re), _real("cos", z.re), _real("tanh", z.im)
     size = cosine * cosine + sine * sine * ratio * ratio
     return Pair(sine * cosine * (1.0 - ratio * ratio) / size, ratio / size)
 
 
 def _derive_circular(function: Callable) -> Callable:
-    """The circular function of a hyperbolic one, or the other way about: f(z) = −i F(i z)."""
+    """The circular function f of a hyperbolic function F, or the converse: f(z) = −i F(i z)."""
     return lambda z: function(z.multiply_by_i).divide_by_i
 
 

@@ -1,9 +1,9 @@
-"""Arrays that are indexed by numbers of the motion, as look-ups in tables (`_look_ups`).
+"""Arrays indexed by numbers that vary along the motion: look-ups in tables (`_look_ups`).
 
-Where the array lies in a row as inputs of the program, or consists of numbers, an entry of it is read from memory,
-however long it is. What is computed from such arrays entry by entry is computed from their entries: (a x + b)[i] is
-a x[i] + b. Of any other array, a cumulative sum say, the entry is chosen among all of them, if they are few. Indices
-that fold to numbers are none of this (`_rules`).
+If the entries of the array are consecutive inputs of the program, or constants, an entry is read from memory, for any
+length. Elementwise functions of such arrays are applied to their entries: (a x + b)[i] is a x[i] + b. In any other
+array, a cumulative sum say, the entry is selected among all of them, if they are few. Constant indices are handled by
+`_rules`.
 """
 
 import math
@@ -27,7 +27,7 @@ def are_numbers(expansion: Any, ids: Ids) -> bool:
 
 
 def locate_knots(expansion: Any, knots: Ids, x: Ids, closed: bool) -> Ids | None:
-    """The number of increasing `knots` at most x, less one (`_look_ups.Located`); None where they are no table."""
+    """The number of increasing `knots` at most x, less one (`_look_ups.Located`); None if they are not a table."""
     table = _table_of_array(expansion, knots) if knots.size else None
     if table is None or table.stride < 0:
         return None
@@ -37,7 +37,7 @@ def locate_knots(expansion: Any, knots: Ids, x: Ids, closed: bool) -> Ids | None
 
 
 def count_knots(expansion: Any, knots: Ids, x: Ids, side: str) -> Ids | None:
-    """The number of increasing knots below x (`side` "left") or at most x; None where they are no table, and many."""
+    """The number of increasing knots below x (`side` "left") or at most x; None for many knots without a table."""
     f, one = expansion.map, expansion.constants(np.int32(1))
     if side == "right":
         found = locate_knots(expansion, knots, x, closed=False)
@@ -51,9 +51,9 @@ def count_knots(expansion: Any, knots: Ids, x: Ids, side: str) -> Ids | None:
 
 
 def look_up_windows(expansion: Any, x: Ids, indices: Ids, axes: Any, sizes: Any, missing: Any) -> Ids:
-    """The windows (*sizes) of an array that begin at `indices` (…, axes) along some axes, shape (…, *sizes).
+    """The windows (*sizes) of an array that start at `indices` (…, axes) along some axes, shape (…, *sizes).
 
-    A window that sticks out begins where it fits; or is `missing`, where that is a number.
+    A window that exceeds the array is moved inside; or is filled with `missing`, if that is a number.
     """
     if not x.size:
         raise Unlowerable("an index into an array without elements depends on the values of the inputs")
@@ -77,12 +77,12 @@ def look_up_windows(expansion: Any, x: Ids, indices: Ids, axes: Any, sizes: Any,
 
 
 def kind_of_ids(graph: Graph, x: Ids) -> str:
-    """The kind of an array; what is no node yet is a float."""
+    """The kind of an array of ids; ids without nodes are floats."""
     return graph.kinds[x.flat[0]] if x.size and x.flat[0] < INPUTS else "float"
 
 
 def _array_entry(expansion: Any, ids: Ids, place: int) -> int:
-    """The entry of this number, a float that is whole; the nearest where there is none."""
+    """The node of the entry at `place`, a whole float, clipped to the array."""
     graph = expansion.graph
     if (table := _table_of_array(expansion, ids)) is not None:
         entry, kind = graph.apply("take", place, attribute=table), kind_of_ids(graph, ids)
@@ -114,7 +114,7 @@ def _array_entry(expansion: Any, ids: Ids, place: int) -> int:
 
 
 def _common_combination(graph: Graph, ids: Ids) -> dict[int, np.ndarray] | None:
-    """The coefficients by base where all scalars are combinations of the same few others, as of a times a table."""
+    """The coefficients, by base, if all scalars are linear combinations of the same few; else None."""
     if ids.max() >= INPUTS or any(graph.kinds[i] != "float" for i in ids.tolist()):
         return None
     terms: list[dict[int, float]] = []
@@ -128,7 +128,7 @@ def _common_combination(graph: Graph, ids: Ids) -> dict[int, np.ndarray] | None:
 
 
 def _common_operands(graph: Graph, ids: Ids) -> list[Ids] | None:
-    """The operands of scalars that are all computed by one operation, each as an array; None of any others."""
+    """The arrays of operands, if all scalars are results of the same operation; else None."""
     if ids.max() >= INPUTS:
         return None
     nodes = [graph.nodes[i] for i in ids.tolist()]
@@ -147,7 +147,7 @@ def _common_operands(graph: Graph, ids: Ids) -> list[Ids] | None:
 
 
 def _window_place(expansion: Any, indices: Ids, room: list[int], strides: list[int]) -> tuple[Ids, Ids]:
-    """The beginnings of windows, as floats: one index as it is, of several their place in the array; and which fit."""
+    """The starts of windows as floats (an index, or an offset in the flattened array), and a mask: they fit."""
     f, number, place, inside = expansion.map, expansion.constants, None, None
     for k, (top, stride) in enumerate(zip(room, strides, strict=True)):
         index = [_as_float(expansion.graph, i) for i in indices[..., k].ravel().tolist()]
@@ -163,7 +163,7 @@ def _window_place(expansion: Any, indices: Ids, room: list[int], strides: list[i
 
 
 def _as_float(graph: Graph, i: int) -> int:
-    """An integer as a float. What it was computed by with integers is computed with floats: these are exact, too."""
+    """An integer node as a float; the integer operations that computed it become float ones, which are exact too."""
     if i not in graph.floats:
         graph.floats[i] = _compute_as_float(graph, i)
     return graph.floats[i]
@@ -195,7 +195,7 @@ def _compare_floats(graph: Graph, i: int) -> int:
 
 
 def _table_of_array(expansion: Any, x: Ids) -> Table | None:
-    """The table whose entries are those of an array, in C order; None where there is none, or its entries move."""
+    """The table whose entries are those of an array, in C order; None if there is none, or its entries vary."""
     table = _table_of_ids(expansion.graph, x.ravel())
     return (
         None if table is not None and table.numbers is None and min(table.positions) < expansion.graph.moving else table

@@ -42,7 +42,7 @@ _MOST_UNKNOWNS = 512
 
 
 def solution(a, b):
-    """X with A X = B, for A (n, n) and B (n, m)."""
+    """The solution X of A X = B, for A (n, n) and B (n, m)."""
     n = a.shape[0]
     if n == 1:
         return b / a
@@ -54,7 +54,7 @@ def solution(a, b):
 
 
 class Orthogonalized(NamedTuple):
-    """A = Q R for A (n, n): the columns of Q, orthogonal with the `weights` of the rows; R has a unit diagonal.
+    """A = Q R for A (n, n): the columns of Q are orthogonal with the `weights` of rows; R has a unit diagonal.
 
     - `columns` (n, n): qₖ, as rows; `duals` (n, n): W qₖ / qₖᵀ W qₖ, as rows.
     - `ratios` (n (n − 1) / 2,): R above its diagonal, row by row.
@@ -82,7 +82,7 @@ def orthogonalize(a) -> Orthogonalized:
 
 
 def solve_orthogonalized(factors: Orthogonalized, b):
-    """X with A X = B, for B (n, …): of every column of Q what B has of it, and then R."""
+    """The solution X of A X = B, for B (n, …): coefficients of B by the columns of Q, then back substitution in R."""
     n, parts = factors.columns.shape[0], []
     b = [b[i] for i in range(n)]
     for k in range(n):
@@ -99,7 +99,7 @@ def solve_orthogonalized(factors: Orthogonalized, b):
 
 
 def row_weights(a):
-    """A number for each row of A that takes out the units of it, a power of two: nothing is rounded by them."""
+    """A power of two for each row of A that normalises its scale without rounding."""
     return 1.0 / xp.binade(_sum([a[:, j] * a[:, j] for j in range(a.shape[1])]))
 
 
@@ -109,10 +109,10 @@ def _sum(rows):
 
 
 def determinant(a):
-    """The determinant of A (n, n), with the error of elimination and without its divisions by zero.
+    """The determinant of A (n, n), as accurate as by elimination, but without its divisions by zero.
 
-    That of Q is expanded by minors, n 2ⁿ⁻¹ products: its columns are orthogonal, so that little cancels. Only where
-    one of the first columns depends on those before it there is no Q.
+    That of Q is expanded by minors, n 2ⁿ⁻¹ products: its columns are orthogonal, so that little cancels. Q does not
+    exist only where one of the first columns depends on those before it.
     """
     n = a.shape[0]
     if n > 3:
@@ -131,7 +131,7 @@ def determinant(a):
 
 
 def cholesky(a):
-    """The lower L with L Lᵀ = A (n, n), of which only the lower half is read; NaN where A is not positive definite."""
+    """The lower L with L Lᵀ = A (n, n), whose lower half is read; NaN where A is not positive definite."""
     n, zero = a.shape[0], 0.0 * a[0, 0]
     rows: list[list[Any]] = [[zero] * n for _ in range(n)]
     left = {(i, j): a[i, j] for i in range(n) for j in range(i + 1)}
@@ -146,7 +146,7 @@ def cholesky(a):
 
 
 def substitute(a, b, lower: bool, unit_diagonal: bool):
-    """X with A X = B, for a triangular A (n, n) and B (n, m)."""
+    """The solution X of A X = B, for a triangular A (n, n) and B (n, m)."""
     n = a.shape[0]
     unknowns: dict[int, Any] = {}
     for k in range(n) if lower else reversed(range(n)):
@@ -162,7 +162,7 @@ def substitute(a, b, lower: bool, unit_diagonal: bool):
 
 @lowers("custom_linear_solve")
 def _linear_solve(expansion, params, *arguments):
-    """A linear system by its matrix, for each solver of JAX: `linalg.solve` and `inv`, and what uses them."""
+    """Lower `custom_linear_solve` by its matrix: `linalg.solve`, `inv`, and functions that use them."""
     count = params["const_lengths"].matvec
     right = arguments[count:]
     matrix = _matrix_of(expansion, params["jaxprs"].matvec, arguments[:count])
@@ -181,7 +181,7 @@ def _linear_solve(expansion, params, *arguments):
 
 
 def _matrix_of(expansion: Expansion, matvec, constants) -> np.ndarray:
-    """The matrix of a linear function of its last arguments, as ids: its derivative, in a graph of its own."""
+    """The matrix, as ids, of a linear function of its last arguments: its derivative, from a separate graph."""
     shapes = [variable.aval for variable in matvec.jaxpr.invars]
     if sum(shape.size for shape in shapes[len(constants) :]) > _MOST_UNKNOWNS:
         raise Unlowerable("a linear system is too large to be written out as scalars")
@@ -201,7 +201,7 @@ def _matrix_of(expansion: Expansion, matvec, constants) -> np.ndarray:
 
 
 def _diagonal_blocks(expansion: Expansion, matrix: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The rows and columns of the parts of a matrix that its zeros keep apart; the whole where one is not square."""
+    """The rows and columns of the diagonal blocks of a matrix by its zeros; one block if any is not square."""
     n, values = len(matrix), [expansion.graph.value(i) for i in matrix.ravel().tolist()]
     links = np.zeros((2 * n, 2 * n), bool)  # of rows with columns
     links[:n, n:] = np.reshape([value != 0 for value in values], matrix.shape)
@@ -218,7 +218,7 @@ def _require_small(what: str, size: int) -> None:
 
 
 def _map_matrices(what: str, function: Callable, expansion: Expansion, *arrays: np.ndarray) -> list[np.ndarray]:
-    """The results of a formula for each of the matrices in some arrays, (…, n, m), in arrays (…, *)."""
+    """The results (…, *) of a formula applied to each matrix of the arrays (…, n, m)."""
     _require_small(what, arrays[0].shape[-1])
     batch = arrays[0].shape[:-2]
     done = [function(*(Scalars(expansion, x[at]) for x in arrays)) for at in np.ndindex(*batch)]

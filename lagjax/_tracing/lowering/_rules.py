@@ -33,7 +33,7 @@ LARGEST_WORK = 20_000_000
 
 
 class Expansion:
-    """A jaxpr being turned into a graph, and what that has cost so far."""
+    """A jaxpr under conversion to a graph, with a count of the work done so far."""
 
     def __init__(self, graph: Graph):
         self.graph = graph
@@ -43,7 +43,7 @@ class Expansion:
         self._work = 0
 
     def run(self, jaxpr, constants, arguments) -> list[np.ndarray]:
-        """The outputs of a jaxpr as id arrays; equations nothing depends on are skipped."""
+        """The outputs of a jaxpr as id arrays; equations on which no output depends are skipped."""
         scope = dict(zip(jaxpr.constvars, constants, strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
 
         def read(atom):
@@ -58,7 +58,7 @@ class Expansion:
         return self.run(jaxpr.jaxpr, [self.constants(value) for value in jaxpr.consts], arguments)
 
     def real(self, array: np.ndarray) -> np.ndarray:
-        """The array with a node for every scalar of it: what computes with an entry of a table makes it one."""
+        """The array with a node for every scalar: entries of long arrays get nodes when they are computed with."""
         if not array.size or array.max() < INPUTS:
             return array
         self.work(array.size)
@@ -83,7 +83,7 @@ class Expansion:
         return np.arange(first, first + re.size, dtype=np.int64).reshape(re.shape)
 
     def parts(self, array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The real and the imaginary parts of numbers that may be complex."""
+        """The real and the imaginary parts of an array that may contain complex numbers."""
         zero = self.graph.constant(0.0, "float")
         ids = self.real(array).ravel().tolist()
         pairs = [self._pairs[i - PAIRS] if i >= PAIRS else (i, zero) for i in ids]
@@ -97,7 +97,7 @@ class Expansion:
         return self.map_ids(functools.partial(self.graph.apply, op, attribute=attribute), *arrays)
 
     def map_ids(self, function: Callable[..., int], *arrays: np.ndarray) -> np.ndarray:
-        """A function of scalars, here their ids, for each of arrays."""
+        """Apply a function of scalar ids to each element of arrays that broadcast."""
         arrays = np.broadcast_arrays(*map(self.real, arrays))
         self.work(arrays[0].size)
         self.traced_operations += arrays[0].size
@@ -105,18 +105,18 @@ class Expansion:
         return _scalar_ids([function(*of) for of in columns], arrays[0].shape)
 
     def fold(self, op: str, array: np.ndarray) -> np.ndarray:
-        """`op` along the first axis, from the left."""
+        """Reduce an array along its first axis by the operation `op`, from the left."""
         return functools.reduce(lambda total, row: self.map(op, total, row), array)
 
     def require_numbers(self, array: np.ndarray, what: str) -> np.ndarray:
-        """The numbers behind an array of constants."""
+        """The values of an array of constants; raises `Unlowerable`, naming `what`, if one depends on inputs."""
         values = [self.graph.value(i) for i in array.ravel().tolist()]
         if None in values:
             raise Unlowerable(f"{what} depends on the values of the inputs")
         return np.array(values, dtype=np.int64).reshape(array.shape)
 
     def work(self, count: int) -> None:
-        """Give up before the work is done, not after."""
+        """Count work; raise `Unlowerable` before too much of it is done."""
         self._work += count
         if self._work > min(WORK_PER_OPERATION * self.graph.budget, LARGEST_WORK):
             raise Unlowerable(
@@ -140,7 +140,7 @@ class Expansion:
         return list(result) if equation.primitive.multiple_results else [result]
 
     def lower_primitive(self, name: str, params, arguments):
-        """The result of a primitive of real numbers, or of one that has other functions in it or only moves numbers."""
+        """The result of a primitive of real numbers, or of one that calls functions or only moves numbers."""
         if name not in MOVES and name not in _PASSING_ON:
             arguments = [self.real(x) for x in arguments]
         if name in MOVES:
@@ -157,7 +157,7 @@ def is_complex(dtype) -> bool:
 
 
 def kind_of(dtype) -> str:
-    """The kind of a scalar of this type: floats share one, as the program takes the precision of its inputs."""
+    """The kind of a scalar of this type; all floats share one, since a program has the precision of its inputs."""
     if jnp.issubdtype(dtype, jnp.floating):
         return "float"
     if dtype == np.bool_ or jnp.issubdtype(dtype, jnp.integer):
@@ -166,7 +166,7 @@ def kind_of(dtype) -> str:
 
 
 def inputs_of(graph: Graph, shapes) -> list[np.ndarray]:
-    """The inputs of a graph for arrays of these shapes, as ids; those of long arrays are no nodes yet."""
+    """The inputs of a graph as id arrays of these shapes; elements of long arrays get no nodes yet."""
     arguments, count, many, kinds = [], 0, len(shapes) > MOST_NUMBERS, {}
     for shape in shapes:
         if (kind := kinds.get(shape.dtype)) is None:
@@ -194,7 +194,7 @@ def live_equations(jaxpr) -> list:
 
 
 def find_variables(equation) -> list:
-    """The operands of a lowered equation: of a linear system the matrix and the right-hand side, not JAX's factors."""
+    """The operands of a lowered equation: for a linear system the matrix and right side, not JAX's factors."""
     if equation.primitive.name != "custom_linear_solve":
         return equation.invars
     lengths = equation.params["const_lengths"]
@@ -202,15 +202,17 @@ def find_variables(equation) -> list:
 
 
 def formula_of(equation) -> str | None:
-    """The name of the function of JAX that a call is, if that has a formula here ("det", "hypot" …); or None.
+    """The name of the JAX function that a call is, if it has a formula here ("det", "hypot" …); else None.
 
-    JAX has rules of its own for their derivatives, which agree with those of any formula for them.
+    JAX has derivative rules of its own for these, which agree with those of any formula.
     """
     name, operands = equation.primitive.name, [variable.aval for variable in equation.invars]
     if name in ("jit", "pjit"):
         called, floats = equation.params["name"], [jnp.issubdtype(x.dtype, jnp.floating) for x in operands]
         suits = called in _FORMULAS and len(floats) == _FORMULAS[called] and (all if called == "hypot" else any)(floats)
         return called if suits and _match_library_call(called, equation.params["jaxpr"]) is not None else None
+    if name == "custom_jvp_call" and len(operands) == 2:
+        return "logaddexp" if _match_library_call("logaddexp", equation.params["call_jaxpr"]) is not None else None
     if name != "custom_jvp_call" or len(operands) != 1:
         return None
     shape, dtype = operands[0].shape, operands[0].dtype
@@ -226,9 +228,9 @@ _FORMULAS = {"remainder": 2, "floor_divide": 2, "divmod": 2, "trunc": 1, "signbi
 
 
 def _match_library_call(called: str, body: core.ClosedJaxpr, options: Sequence[dict] = ({},)) -> dict | None:
-    """The options with which a function of JAX has this body, if the call that is named like it is that; or None.
+    """The options with which the JAX function `called` has this body, if the call is that function; else None.
 
-    Its text tells, or, as that is another one under `vmap`, the scalars that are made of both.
+    The texts of both bodies are compared or, as that differs under `vmap`, the scalar programs of both.
     """
     operands = [(x.shape, x.dtype, x.weak_type) for x in body.in_avals]
     bodies = [lambda of=of: _function_body(called, *operands, **of) for of in options]
@@ -252,17 +254,18 @@ def _check_same_body(*bodies: core.ClosedJaxpr) -> bool:
 
 @functools.cache
 def _function_body(called: str, *operands, **options) -> core.ClosedJaxpr | None:
-    """The body of a function of JAX, of operands of these shapes and types."""
+    """The body of a JAX function for operands of these shapes and types."""
     given = [jax.ShapeDtypeStruct(shape, dtype, weak_type=weak) for shape, dtype, weak in operands]
     equations = jax.make_jaxpr(functools.partial(getattr(jnp, called), **options))(*given).eqns
-    return next((e.params["jaxpr"] for e in equations if e.params.get("name") == called), None)
+    rules = (e.params["call_jaxpr"] for e in equations if "call_jaxpr" in e.params)
+    return next((e.params["jaxpr"] for e in equations if e.params.get("name") == called), next(rules, None))
 
 
 _OWN_RULES = frozenset(("stop_gradient", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"))
 
 
 def has_own_rules(jaxpr) -> bool:
-    """True if a jaxpr, or one that it calls, asks for other derivatives than those of its operations."""
+    """True if a jaxpr, or one that it calls, has custom derivative rules."""
     for equation in live_equations(jaxpr):
         name = equation.primitive.name
         inner = equation.params["call_jaxpr"].eqns if name == "custom_jvp_call" else ()
@@ -282,7 +285,7 @@ def _inner_jaxprs(equation) -> list:
 
 @functools.cache
 def _determinant(name: str, shape: tuple[int, ...], dtype) -> tuple[str, ...]:
-    """The calls with rules of their own in one of JAX's determinants, also under `vmap`, as texts of their bodies."""
+    """The bodies, as texts, of calls with custom rules in one of JAX's determinants, also under `vmap`."""
     function, texts = getattr(jnp.linalg, name), []
     for _ in range(len(shape) - 1):
         (equation,) = jax.make_jaxpr(function)(jax.ShapeDtypeStruct(shape, dtype)).eqns
@@ -306,7 +309,7 @@ def _broadcast_in_dim(params, x):
 
 
 def _pad(params, x, value):
-    """The padded array; `padding_config` is (before, after, between) for each axis, and a negative margin cuts off."""
+    """The padded array; `padding_config` is (before, after, between) for each axis, and a negative margin crops."""
     shape, source, target = [], [], []
     for size, (before, after, between) in zip(x.shape, params["padding_config"], strict=True):
         length = before + after + size + max(size - 1, 0) * between
@@ -380,12 +383,12 @@ def _one_minus_square(expansion, params, x):
 
 @lowers("hypot")
 def _hypotenuse(expansion, params, x, y):
-    """√(x² + y²), which is smooth but for zero; JAX divides by the larger one, and has corners where both are alike."""
+    """√(x² + y²), smooth except at zero; JAX divides by the larger one, which is a border where both are equal."""
     return [expansion.map_ids(functools.partial(take_length, expansion), x, y)]
 
 
 def take_length(expansion, x: int, y: int) -> int:
-    """√(x² + y²), with a slope of zero where it is zero, as |z| has in JAX."""
+    """The node of √(x² + y²), with slope zero where it is zero, as |z| has in JAX."""
     f, numbers = expansion.graph.apply, [expansion.graph.value(i) for i in (x, y)]
     if 0.0 in numbers:
         return f("abs", y if numbers[0] == 0.0 else x)
@@ -401,14 +404,14 @@ def take_length(expansion, x: int, y: int) -> int:
 
 
 def _divide(expansion, params, x, y):
-    """x // y and x mod y, each with one border, where JAX's have five and three."""
+    """x // y and x mod y, each with one border, where JAX's formulas have five and three."""
     x, y = (expansion.map("convert", z, attribute="float") for z in (x, y))
     whole = expansion.map("floor", expansion.map("div", x, y))
     return [whole, expansion.map("sub", x, expansion.map("mul", whole, y))]
 
 
 def _powers_of_two(expansion, x, places):
-    """2ᵏ in the kinds of x, for numbers k of places that x is shifted by."""
+    """The constants 2ᵏ in the kinds of x, where k = `places` is the number of places of a shift."""
     places = np.broadcast_to(expansion.require_numbers(places, "by how many places a number is shifted"), x.shape)
     pairs = [(2**k, expansion.graph.kinds[i]) for k, i in zip(places.ravel().tolist(), x.ravel().tolist(), strict=True)]
     if not all(1 <= power <= np.iinfo(kind).max for power, kind in pairs):
@@ -428,11 +431,12 @@ LOWER.update({
     "shift_right_arithmetic": _shift_right,
     "divmod": _divide, "floor_divide": lambda *of: _divide(*of)[:1], "remainder": lambda *of: _divide(*of)[1:],
     "trunc": lambda expansion, params, x: [expansion.map("trunc", x)],
+    "logaddexp": lambda expansion, params, x, y: [expansion.map("logaddexp", x, y)],  # JAX's has borders
 })  # fmt: skip
 
 
 def _raise_to_power(expansion, exponent: float, i: int) -> int:
-    """uᵖ for a number p; of u = √s, or of a length, from 2 on that is s^(p/2), which is smooth where s is zero."""
+    """The node of uᵖ for a number p; for u = √s, or a length, and p ≥ 2 that is s^(p/2), smooth at s = 0."""
     graph = expansion.graph
     square = expansion.squares.get(i, graph.operand_of("sqrt", i))
     if exponent >= 2 and square is not None and is_nonnegative(graph, square):
@@ -487,7 +491,7 @@ def _select_n(expansion, params, which, *cases):
 
 
 def _choose(expansion, which, cases):
-    """The case an integer counts to; below the first is the first, beyond the last the last."""
+    """The case with number `which`, clipped to the first and the last."""
     if any(map(expansion.has_pairs, cases)):
         parts = zip(*map(expansion.parts, cases), strict=True)
         return expansion.pair(*(_choose(expansion, which, list(of)) for of in parts))
@@ -560,7 +564,7 @@ def _cumulation(op):
 
 
 def _first_extreme(better):
-    """The index of the largest or smallest element along an axis, the first of equal ones."""
+    """Rule of argmax or argmin: the index of the extreme element along an axis, the first of equal ones."""
 
     def rule(expansion, params, x):
         (axis,), kind = params["axes"], kind_of(params["index_dtype"])
@@ -587,9 +591,9 @@ LOWER.update({
 
 @lowers("sort")
 def _sort(expansion, params, *operands):
-    """Neighbours are exchanged until all are in order: n (n − 1) / 2 comparisons, for a few numbers.
+    """Rule of `sort`: a bubble sort of n (n − 1) / 2 comparisons, for few numbers.
 
-    Equal ones keep their places, and with these their derivatives, as in JAX.
+    Equal ones keep their order, and with it their derivatives, as in JAX.
     """
     if params["num_keys"] != 1:
         raise Unlowerable("the primitive `sort` by several keys has no scalar form here")
@@ -629,9 +633,9 @@ def _dynamic_update_slice(expansion, params, x, update, *starts):
 
 
 def _gather_places(indices, shape, offset_dims, collapsed, index_map, operand_batch, indices_batch, sizes, clip):
-    """The place of each element of a gather's result in the flattened operand; -1 for a window that sticks out.
+    """The index in the flattened operand of each element of a gather's result; −1 for a window outside of it.
 
-    The same for a scatter, with the updates in place of the result.
+    For a scatter the updates take the place of the result.
     """
     batch_shape = indices.shape[:-1]
     starts = np.zeros((*batch_shape, len(shape)), dtype=np.int64)
@@ -724,7 +728,7 @@ def _call(expansion, params, *arguments):
 
 
 def expand_primitive(primitive) -> core.ClosedJaxpr:
-    """An operation that JAX itself writes in others, such as `searchsorted` since 0.12, in these."""
+    """The jaxpr of a primitive that JAX itself writes by others, such as `searchsorted` since 0.12."""
 
     def call_expansion(*flat):
         return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, flat)))
@@ -733,7 +737,7 @@ def expand_primitive(primitive) -> core.ClosedJaxpr:
 
 
 def _side_of_search(body, arguments) -> Literal["right", "left"] | None:
-    """The side of `jnp.searchsorted(knots, x, side)`, if a function that is named so is that; None of others."""
+    """The side of `jnp.searchsorted(knots, x, side)`, if a call of that name is this function; else None."""
     shapes = body.in_avals
     if len(shapes) != 2 or arguments[0].ndim != 1 or not len(arguments[0]):
         return None

@@ -6,14 +6,12 @@ matrix at states nearby, the linearised motion. What follows is NumPy and senten
 `_differences`), `_constraint_checks` (with contacts), `_mass`, `_jumps_near`, `_stiffness`.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float
+from jaxtyping import Float, PyTree
 
 from lagjax._engine import DEFAULT_RTOL
 from lagjax._equations import derivation_of, forms
@@ -25,8 +23,6 @@ from lagjax._trust.checks import _constraint_checks, _derivative_checks, _jumps_
 from lagjax._trust.checks._findings import Finding, Findings
 from lagjax._trust.checks._mass import describe_direction
 from lagjax._trust.checks._scene_at_start import CheckedScene
-
-PyTree = Any
 
 # Units of atol: in a motion that is smaller, the errors that atol allows add up to a hundredth within a hundred steps.
 _SMALLEST_COORDINATE = 1e4
@@ -84,7 +80,7 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
 def _scene_findings(system, q, qdot, t, params) -> tuple[list[Finding], str]:
     layout = Layout.from_state(q, qdot)
     if layout.size > forms.LARGEST_DENSE and not derivation_of(system, layout, params).form.is_sparse:
-        system = replace_functions(system, {role: getattr(system, role) for role in ROLES}, "array")
+        system = replace_functions(system, {}, "array")
     scene = CheckedScene.from_state(system, layout, q, qdot, t, params)
     reported = _derivative_checks.findings(scene) + _check_dissipation(scene) + _constraint_checks.findings(scene)
     reported += _constraint_checks.contact_findings(scene) + _mass.findings(scene)

@@ -9,14 +9,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._equations import Derivation, Motion, Sample, Scales, augment, derivation_of, numbers_of, saddle_many
 from lagjax._interface import Layout, as_arrays
 from lagjax._program import Unlowerable
 from lagjax._scene import System
 from lagjax._trust.checks._differences import ladder
-
-PyTree = Any
 
 _NEARBY = 4  # states with different positions, and as many with different velocities
 

@@ -22,8 +22,6 @@ from lagjax._primitives import DOUBLE, widen, with_doubles
 from lagjax._run import Members
 from lagjax._trust.health._laws import Law, Measurements
 
-PyTree = Any
-
 # The factor on the bound of what N steps may add up to, since the error of a step is estimated; √(2n) comes on top, for
 # solvers that measure a root mean square. Twice as large, drifts of 10 to 20 times the bound would go unreported.
 SLACK = 10.0
