@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -145,9 +146,11 @@ class FreeFunction(AbstractLaw):
         if len(arguments) != len(self.axes):
             raise TypeError(f"{self!r} takes {len(self.axes)} argument(s); got {len(arguments)}.")
         kind = jnp.result_type(float, coefficients, *arguments)
-        return self.shape_value(
-            functools.partial(self._spline, coefficients), *(jnp.asarray(x, kind) for x in arguments)
-        )
+        return self._evaluate(coefficients, *(jnp.asarray(x, kind) for x in arguments))
+
+    @functools.partial(jax.jit, static_argnums=0, inline=True)  # outside of `jit` one program
+    def _evaluate(self, coefficients, *x):
+        return self.shape_value(functools.partial(self._spline, coefficients), *x)
 
     def interpolate(self, function: Callable) -> LawParameters:
         """The parameters whose spline takes at its knots the values that `function` of the same arguments gives: where

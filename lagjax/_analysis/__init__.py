@@ -9,6 +9,7 @@ enter by `_scene_state`. `orbits/` holds motions that close, chaos, and paths be
 """
 
 from lagjax._analysis._coordinates import ChangedCoordinates, change_coordinates
+from lagjax._analysis._eigen import exponents_and_modes
 from lagjax._analysis._equilibrium import Equilibrium, equilibrium
 from lagjax._analysis._hamiltonian import CanonicalTrajectory, Hamiltonian, hamiltonian
 from lagjax._analysis._inverse_dynamics import inverse_dynamics

@@ -32,7 +32,7 @@ from lagjax._fit.model._records import Guess, Record, require_untraced
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals
 from lagjax._fit.model._sensors import Delayed, wrapped
 from lagjax._fit.model._timings import Timings
-from lagjax._fit.model._transforms import Smooth, angle, between, inertia, positive, simplex
+from lagjax._fit.model._transforms import Smooth, Unbounded, angle, between, inertia, positive, simplex
 from lagjax._fit.result._comparison import Comparison
 from lagjax._fit.result._evidence import begin_weakly, find_smoothness
 from lagjax._fit.result._experiments import Experiments

@@ -11,9 +11,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import lagjax
-from lagjax._fit import Parameters
-from lagjax._fit.model import _transforms
-from lagjax._fit.model._transforms import Unbounded
+from lagjax._fit import Parameters, Unbounded
 
 TS = np.linspace(0.0, 4.0, 101)
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -171,7 +169,7 @@ def test_a_leaf_that_starts_outside_of_its_set_is_refused(start, transform, mess
 
 
 def test_the_sum_of_a_simplex_is_that_of_its_start():
-    own = _transforms.simplex.specialize(np.array([1.0, 2.0, 4.0]), (3,))
+    own = lagjax.simplex.specialize(np.array([1.0, 2.0, 4.0]), (3,))
     assert np.sum(own.value(np.array([0.3, -2.0]))) == pytest.approx(7.0)
 
 

@@ -225,6 +225,7 @@ def test_a_name_that_is_no_term_is_a_sentence():
 
 @pytest.mark.slow
 def test_the_silverbox_by_its_own_choice(monkeypatch):
+    """Forty seconds: three multisines are fitted anew for every term that is dropped, or taken again."""
     root = Path(__file__).parents[2]
     file = root.parent / "shared" / "data" / "silverbox_multisines.npz"
     if not file.exists():

@@ -10,7 +10,7 @@ import pytest
 from scenes import BALL, HILL, VALLEY
 
 import lagjax
-from lagjax._engine._stop_reason import End, what_stopped
+from lagjax._engine import End, what_stopped
 
 TS = np.linspace(0.0, 2.0, 5)
 BUDGET = {"max_steps": 2000}
