@@ -1,8 +1,8 @@
-"""`lift_problem`: a problem whose functions close over numbers that are being traced, with these as parameters.
+"""`lift_problem`: replace the tracers that a problem's functions close over by parameters of the problem.
 
-`jax.grad(lambda k: simulate(System(lambda q, v: … k …), …))` gives a Lagrangian that reads a tracer. No program can be
-made of that, nor kept. So each function is traced once, as `jax.closure_convert` does, what it took from outside goes
-beside the user's parameters (`Lifted`), and the program serves every other value, and every function with that code.
+`jax.grad(lambda k: simulate(System(lambda q, v: … k …), …))` gives a Lagrangian that reads a tracer, which cannot be
+compiled or cached. So each function is traced once, as `jax.closure_convert` does, and the tracers become parameters
+beside the user's (`Lifted`): the compiled program then serves every value of k, and every function with that code.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ class Lifted(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _FunctionTrace:
-    """A function of the user as it was traced, for parameters that are `Lifted`."""
+    """A callable made of the jaxpr of a user's function, called with `Lifted` parameters in place of the user's."""
 
     name: str
     jaxpr: Any  # whose first arguments are the constants
@@ -53,7 +53,7 @@ class _FunctionTrace:
 
 @dataclass(frozen=True, eq=False)
 class Unchanged:
-    """A function of the user that reads no tracer, for parameters that are `Lifted`."""
+    """A user's function that closes over no tracer, callable with `Lifted` parameters in place of the user's."""
 
     function: Function
 
@@ -66,7 +66,7 @@ class Unchanged:
 
 
 def lift_problem(problem: Problem) -> Problem:
-    """The problem with the tracers that its functions close over as parameters; itself where they close over none."""
+    """Return the problem with `Lifted` parameters, or `problem` itself if its functions close over no tracer."""
     fields = object.__getattribute__(problem.system, "__dict__")  # an attribute of an equinox.Module takes 2 µs
     present = [f for role in ROLES if isinstance(f := fields[role], Function)]
     if problem.event is not None:
@@ -91,7 +91,7 @@ def lift_problem(problem: Problem) -> Problem:
 
 
 def lift_batch(batch: Batch) -> Batch:
-    """A batch with the tracers that its functions close over as parameters of all members."""
+    """Do the same for a batch: the values become parameters with the same value in all members."""
     member = lift_problem(batch.member)
     if member is batch.member:
         return batch
@@ -100,6 +100,7 @@ def lift_batch(batch: Batch) -> Batch:
 
 
 def _lift_function(function: Function, roles: int, problem: Problem, values: list) -> Function:
+    """Trace a function of `roles` vectors and t; append the tracers that it closes over to `values`, in place."""
     extras = tuple(dict.fromkeys((*function.extras, "params")))
     if not function.code.tracers or "inputs" in function.extras:
         return Function(None, Edition.from_function(Unchanged(function)), extras)

@@ -1,7 +1,7 @@
-"""A scene whose functions ask for `inputs`, as one whose functions ask for `t` and `params` alone.
+"""Replace the argument `inputs` of a scene's functions by parameters, so that they take `t` and `params` alone.
 
-Its parameters are `Driven`: those of the user, and beside them numbers in which a function finds the inputs at the time
-t. `fit` keeps a table of samples there, `linearize` the inputs themselves.
+The parameters become `Driven`: the user's, and data from which `find_inputs(data, t)` computes the inputs at time t. In
+`fit` the data are a table of samples, in `linearize` the inputs themselves.
 """
 
 import functools
@@ -19,14 +19,14 @@ from lagjax._scene._system import ROLES, System, replace_functions
 
 
 class Driven(NamedTuple):
-    """The parameters of a scene with inputs: those of the user, and what the inputs are found in."""
+    """Parameters (params of the user, inputs): of a scene with inputs, with data that the inputs are computed from."""
 
     params: PyTree
     inputs: PyTree
 
 
 class _FunctionOfInputs(eqx.Module):
-    """A function of the user, for parameters that are `Driven`; `find_inputs(held, t)` are its inputs."""
+    """A user's function, called with parameters `Driven`: it gets `find_inputs(params.inputs, t)` as its inputs."""
 
     function: Function
     find_inputs: Callable = eqx.field(static=True)
@@ -43,7 +43,7 @@ class _FunctionOfInputs(eqx.Module):
 
 
 def drive_scene(system: System, find_inputs: Callable, extras: tuple[str, ...] = ("params",)) -> System:
-    """The scene for parameters that are `Driven`; `extras` are what finding the inputs takes, "params" or "t" too."""
+    """Return the scene for parameters `Driven`; `extras` names what `find_inputs` depends on: "params", or "t" too."""
     arrays, scene = jax.tree.flatten(system)
     return _drive_system(system, find_inputs, extras) if arrays else _driven_from_tree(scene, find_inputs, extras)
 
@@ -61,7 +61,7 @@ def _drive_system(system: System, find_inputs: Callable, extras: tuple[str, ...]
 
 
 def drive_function(function: Function, find_inputs: Callable, extras: tuple[str, ...]) -> Function:
-    """A function of a scene for parameters that are `Driven`, as `drive_scene` makes it of all."""
+    """Return one function of a scene for parameters `Driven`; `drive_scene` does this for all."""
     arrays, code = eqx.partition(_FunctionOfInputs(function, find_inputs), eqx.is_array)
     finding = extras if "inputs" in function.extras else ("params",)  # laws of contacts take nothing else
     asked = tuple(x for x in dict.fromkeys((*finding, *function.extras)) if x != "inputs")
@@ -69,12 +69,12 @@ def drive_function(function: Function, find_inputs: Callable, extras: tuple[str,
 
 
 def held_inputs(held: PyTree, t: Any) -> PyTree:
-    """The inputs of a scene in which they are held."""
+    """A `find_inputs` for inputs that are constant in time: returns them."""
     return held
 
 
 def push_by_inputs(system: System) -> System:
-    """The scene with further generalised forces: its `inputs`, in the structure of q."""
+    """Return the scene with its `inputs`, in the structure of q, added to the generalised forces."""
     own = system.forces
 
     def forces(q, qdot, t, params, inputs, **more):
@@ -88,6 +88,6 @@ def push_by_inputs(system: System) -> System:
 
 
 def asking_for_inputs(system: System) -> list[str]:
-    """The roles of functions of the scene that ask for `inputs`."""
+    """Return the roles of the scene's functions that take `inputs`."""
     functions = ((role, getattr(system, role)) for role in ROLES)
     return [role for role, function in functions if function is not None and "inputs" in function.extras]
