@@ -1,9 +1,9 @@
-"""Contacts that are closed at a state, as constraints of the analysis, and whether they stay so.
+"""Contacts that are closed at a state, taken as constraints in the analysis, with a check that they stay closed.
 
     closed: g = 0, force ∇g λ with λ ≥ 0        open: g > 0, λ = 0
 
-A gap that is zero at the state is held. What is found so is true of the scene with contacts where every held gap pushes
-and every other one stays open; else a sentence says which one opens, or closes.
+A gap that is zero at the state becomes a constraint. The result holds for the scene with contacts if every such λ ≥ 0
+and every other gap stays open; else an error names the contact that opens or closes.
 """
 
 from typing import Any, NamedTuple
@@ -25,7 +25,7 @@ _UNLOADED = 1e-9  # of the largest force: one that is rounding
 
 
 class HeldScene(NamedTuple):
-    """The scene with the gaps at the `places` (c,) among its constraints; and with contacts, as the user gave it."""
+    """The scene with the gaps at `places` (c,) as constraints, and the scene with contacts (`given`)."""
 
     system: System
     given: System
@@ -72,9 +72,9 @@ class HeldScene(NamedTuple):
         return multipliers, fine, self._explain_opening(pushes, "At the equilibrium that was found")
 
     def require_loaded(self, q: PyTree, qdot: PyTree, params: PyTree, why: str) -> PyTree:
-        """q, where all that is held presses; else raise `ValueError`, or, where that is being traced, q as NaN.
+        """Return q if every closed contact presses; else raise `ValueError`, or return NaN if traced.
 
-        The error says which contact does not press, and `why` it has to.
+        The message says which contact does not press, and `why` it has to.
         """
         if not self.places:
             return q
@@ -102,10 +102,10 @@ def one_sided_reason(what: str) -> str:
 
 
 def hold_closed(system: Any, q: PyTree, qdot: PyTree, params: PyTree, what: str) -> HeldScene | None:
-    """The scene with the gaps held that are zero at the state; None for one without contacts.
+    """Return the scene with the gaps that are zero at the state as constraints; None if it has no contacts.
 
-    Raises `ValueError` where a gap is negative or closes with a velocity, where a closed contact has friction, and
-    where it is not known which are closed.
+    Raises `ValueError` if a gap is negative or closes with a velocity, if a closed contact has friction, and if q is
+    traced, so that it is not known which are closed.
     """
     if not isinstance(system, System) or not system.touches:
         return None
@@ -146,7 +146,7 @@ def hold_closed(system: Any, q: PyTree, qdot: PyTree, params: PyTree, what: str)
 
 
 def _pressing_shares(jacobian: np.ndarray, force: np.ndarray, rows: np.ndarray) -> np.ndarray | None:
-    """λ (m,) with F + Gᵀλ = 0 that is not negative in these `rows`; None where there is none."""
+    """Return λ (m,) with F + Gᵀλ = 0 that is not negative in these `rows`; None if there is none."""
     both = np.delete(np.arange(len(jacobian)), rows)
     shares, left = nnls(np.concatenate([jacobian[rows], jacobian[both], -jacobian[both]]).T, -force)
     if left > _UNLOADED * np.linalg.norm(force):
@@ -162,13 +162,13 @@ def _allowed_velocities(q: PyTree, qdot: PyTree) -> PyTree:
 
 
 def _gaps_and_slopes(flat: Flat, q, params: PyTree) -> tuple:
-    """All gaps (k,) and their gradients (k, n) at q (n,)."""
+    """Return all gaps (k,) and their gradients (k, n) at q (n,)."""
     time = jnp.zeros((), q.dtype)
     return flat.gaps(q, time, params), jax.jacfwd(flat.gaps)(q, time, params)
 
 
 def _gap_sizes(gaps, slopes, q):
-    """The sizes (k,) of what makes gaps; where q is zero that is what rounding leaves of terms of one."""
+    """Return the magnitudes (k,) of the terms of each gap, for the rounding error of the gap."""
     return abs(slopes) @ abs(q) + 1e-8 * (1.0 + abs(gaps))
 
 
@@ -186,7 +186,7 @@ def _require_no_friction(flat: Flat, places: tuple[int, ...], params: PyTree, wh
 
 
 def _hold_contacts(system: System, places: tuple[int, ...]) -> System:
-    """The scene with these gaps among its constraints, and without contacts."""
+    """Return the scene with these gaps as constraints, and without contacts."""
     bare, own, contacts = drop_contacts(system), system.constraints, system.contacts
     if not places or contacts is None:
         return bare

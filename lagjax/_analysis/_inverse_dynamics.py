@@ -1,4 +1,4 @@
-"""`inverse_dynamics`: the forces that an acceleration takes."""
+"""`inverse_dynamics`: the forces that produce a given acceleration."""
 
 from jaxtyping import PyTree
 

@@ -28,7 +28,7 @@ Vector = Float[Array, " n"]
 
 
 def require_matrices(size: int, what: str, advice: str) -> None:
-    """Raise `ValueError`, with the `advice`, where `what` takes matrices too large for this number of coordinates."""
+    """Raise `ValueError`, with the `advice`, if `what` needs dense matrices too large for `size` coordinates."""
     if size > forms.LARGEST_ANALYSED:
         raise ValueError(
             f"{what}: not tried for {size} coordinates, which takes matrices of n × n numbers, {8e-9 * size**2:.2g} GB "

@@ -23,7 +23,7 @@ from lagjax._scene._system import ARGUMENTS, ROLES, replace_functions
 
 
 class Lifted(NamedTuple):
-    """The parameters of the user, and numbers that functions closed over, or by which modes differ."""
+    """Parameters (params of the user, values): values are numbers that functions close over or modes differ by."""
 
     params: PyTree
     values: tuple

@@ -1,4 +1,4 @@
-"""The equations of a scene to read: M q̈ = F + Gᵀλ with all numbers by the names that the user gave them."""
+"""The equations of a scene as formulas: M q̈ = F + Gᵀλ, with all numbers by the names that the user gave them."""
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -66,7 +66,7 @@ class Equations:
 
 
 def write_equations(system: "System", layout: Layout, params: PyTree, inputs: PyTree) -> Equations:
-    """The result of `System.equations`."""
+    """Return the result of `System.equations`."""
     names = system.constraint_names(layout, params) if system.constraints or system.velocity_constraints else []
     numbers = [*number_names(params, "params"), *number_names(inputs, "inputs")]
     if inputs is not None:
@@ -92,7 +92,7 @@ def write_equations(system: "System", layout: Layout, params: PyTree, inputs: Py
 
 
 class _FormulaPage:
-    """The formulas of a scene, and how they are written."""
+    """The formulas of a scene, and their writers for Python and for LaTeX."""
 
     def __init__(self, formulas: Formulas, sums: dict[str, np.ndarray], names: list[Name], constraints: list[str]):
         self.sums, self.names, self.constraints = sums, names, short_names(constraints)

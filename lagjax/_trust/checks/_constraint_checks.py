@@ -1,5 +1,4 @@
-"""Constraints and contacts: whether constraints are satisfied, and whether one follows from others; whether the motion
-starts inside a contact, or moves into one that is closed; and whether each has a gradient."""
+"""Checks of constraints and contacts: satisfied, independent, with a gradient, and not violated at the start."""
 
 import jax
 import jax.numpy as jnp
@@ -48,7 +47,7 @@ def _check_finite(name: str, value) -> Finding:
 
 
 def _check_zero_gradients(name: str, of_velocities: bool, value, rows: np.ndarray) -> Finding:
-    """A constraint whose gradient is zero: of no use here, and often an inequality or a square."""
+    """Return the finding for a constraint with zero gradient, which is often an inequality or a square."""
     if of_velocities:
         message = (
             f"{name} does not depend on qdot here, so that no force can keep it. Give what depends on q alone as "
@@ -70,7 +69,7 @@ def _check_zero_gradients(name: str, of_velocities: bool, value, rows: np.ndarra
 
 
 def _check_affine(names, jacobian, positions: int, layout: Layout) -> list[Finding]:
-    """Warnings where ∂a/∂q̇ changes with q̇; the last half of the states differs from the state itself in q̇ alone."""
+    """Return warnings where ∂a/∂q̇ changes with q̇; the last half of the sampled states differs in q̇ alone."""
     reported = []
     for k in range(positions, len(names)):
         others = jacobian[(len(jacobian) + 1) // 2 :, k]
@@ -86,7 +85,7 @@ def _check_affine(names, jacobian, positions: int, layout: Layout) -> list[Findi
 
 
 def _check_independent(schur: np.ndarray, names: list[str]) -> list[Finding]:
-    """Advice for each constraint that is a combination of others, from the Schur complement (m, m)."""
+    """Return advice for each constraint that depends linearly on others, from the Schur complement (m, m)."""
     reported = []
     for row, factors in dependent_rows(schur).items():
         others = tuple(name for name, factor in zip(names, factors, strict=True) if factor)
