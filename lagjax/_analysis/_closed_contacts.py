@@ -42,7 +42,7 @@ class HeldScene(NamedTuple):
         return np.arange(self.own, self.own + len(self.places))
 
     def split(self, multipliers, layout: Layout, params: PyTree) -> tuple:
-        """The multipliers of the constraints and the normal forces of all contacts, in the structures of the user."""
+        """Split multipliers (m,) into those of constraints and the normal forces of contacts, as user's pytrees."""
         end = self.own + len(self.places)
         forces = jnp.zeros(len(self.names), multipliers.dtype)
         forces = forces.at[np.array(self.places, int)].set(multipliers[self.own : end])
@@ -51,7 +51,7 @@ class HeldScene(NamedTuple):
         return of_constraints, self.flat.shapes.name_numbers(forces)
 
     def judge(self, scene: SceneState, q, multipliers, ok) -> tuple:
-        """The multipliers (m,) of an equilibrium at q (n,), whether it is one of the contacts, and why it is none."""
+        """Return the multipliers (m,) of an equilibrium at q (n,), whether contacts allow it, a message if not."""
         pushes, jacobian = multipliers[self._contact_rows], scene.jacobian(q, scene.qdot)
         gaps, slopes = _gaps_and_slopes(self.flat, q, scene.params)
         rounding = _UNLOADED * jnp.max(jnp.abs(multipliers), initial=0.0)

@@ -174,7 +174,7 @@ def _null_space(rows: Float[Array, "m n"], rank: int) -> Float[Array, "n n-rank"
 
 
 def tangent_basis(jacobian: Float[Array, "m n"], rank: int) -> Float[Array, "n n-rank"]:
-    """A basis of the deviations that constraints allow; it moves with the point as little as it can."""
+    """Return a basis of the deviations that constraints allow, in columns, with a minimal derivative by q."""
     if not len(jacobian):
         return jnp.eye(jacobian.shape[1], dtype=jacobian.dtype)
     basis = _null_space(jacobian, rank)

@@ -252,8 +252,10 @@ _TINY = 1e-6  # of the other multipliers: one that counts as their rounding
 
 
 class Steady(NamedTuple):
-    """A motion that is sought: the `cyclic` coordinates (n,), of which velocities are unknown and not the place; the
-    unknowns (n,) that are `held`; `moves` (n, n) and `turns` (n, n, n) are those of `SteadySymmetries`."""
+    """A steady motion to find: `cyclic` coordinates (n,) have unknown velocities, others unknown positions.
+
+    Unknowns that are `held` (n,) are given. `moves` (n, n), `turns` (n, n, n) are those of `SteadySymmetries`.
+    """
 
     cyclic: Bool[Array, " n"]
     held: Bool[Array, " n"]

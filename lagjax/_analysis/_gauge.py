@@ -25,7 +25,7 @@ _ZERO, _RIGHT = 1e-10, 1e-9
 
 
 class Changes(NamedTuple):
-    """The change of L under D transformations at S states: Λ (S, D), ∂Λ/∂q̇ (S, D, n), Λ at rest, the size of its terms.
+    """Changes of L by D transformations at S states: Λ (S, D), ∂Λ/∂q̇ (S, D, n), Λ at rest, the size of its terms.
 
     ∂Λ/∂q̇ is by velocities in units of their sizes, so that it compares with Λ. `gradients` (S, D, 2n) are those of the
     charges p·ξ − h τ − G by q and q̇.

@@ -134,7 +134,7 @@ def _flat_hamiltonian_equations(t, *arguments) -> tuple[Vector, Vector, Array]:
 
 
 def _sparse_newton(motion: SparseMotion, q: Vector, t, numbers: PyTree) -> tuple[Callable, Callable]:
-    """Functions that find a root of p(q, v) by v, and solve with its derivative M, by pattern: for `custom_root`."""
+    """Return functions for `custom_root`: one solves ∂L/∂q̇(q, v) = p for v, one solves with its sparse Jacobian M."""
 
     def solve(multiply, right):
         mass = motion.structure.mass.prepare(multiply, q.dtype)

@@ -162,8 +162,7 @@ class ReducedLinearization(NamedTuple):
 
 @compile_for_one_call
 def _co_rotating_frame(a: Array, rows: Array, qdot: Vector, moves: Array, turns: Array) -> tuple[Array, Array]:
-    """A in a frame that turns with a steady motion, and rows (k + n, 2n) whose last ones, one for each coordinate that
-    is cyclic, are zero for what is orthogonal to a deviation along it."""
+    """Return A in the frame that rotates with a steady motion, and rows (k + n, 2n) that exclude cyclic coordinates."""
     spin = jnp.einsum("i,ijk", qdot, turns.astype(a.dtype))
     moved = jnp.hstack([moves.T.astype(a.dtype), turns.astype(a.dtype) @ qdot])
     return a - jnp.kron(jnp.eye(2, dtype=a.dtype), spin), jnp.concatenate([rows, moved])

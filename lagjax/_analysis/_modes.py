@@ -84,7 +84,7 @@ def _mode_kind(pair: np.ndarray, size: float) -> str:
 
 
 def _growth_threshold(size):
-    """The real part that counts as growth: rounding splits a double zero by √eps of the largest exponent, or more."""
+    """Return the real part that counts as growth: rounding splits a double zero by √eps of the largest exponent."""
     return 7 * float(np.finfo(size.dtype).eps) ** 0.5 * size
 
 

@@ -42,7 +42,7 @@ def _integral(rate: Callable, parts: int, dtype) -> Array:
 
 
 def _work(force: Callable, start: Array, end: Array, scale: np.ndarray) -> Array:
-    """∫ force(q)·dq from `start` to `end` (n,) by the best of some ways; NaN where none is resolved or they differ."""
+    """Return ∫ force(q)·dq from `start` to `end` (n,) by the best of some curves; NaN if inaccurate or they differ."""
     way, size = end - start, jnp.asarray(scale, end.dtype)
     across = jnp.cos(jnp.arange(1.0, len(scale) + 1)).astype(end.dtype)
     length = jnp.sqrt(jnp.sum((way / size) ** 2))
