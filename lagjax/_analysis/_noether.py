@@ -137,12 +137,8 @@ class FlatState(NamedTuple):
 
 def variation(scene: SceneState, transform: Callable, q: Vector, qdot: Vector, t) -> Float[Array, ""]:
     """Return Λ of the transformation (ξ, τ) = `transform(q, t)`."""
-
-    def lagrangian(q, qdot, t):
-        return scene.motion.lagrangian(q, qdot, t, scene.numbers)
-
     (change, of_time), (rate, rate_of_time) = jax.jvp(transform, (q, t), (qdot, jnp.ones_like(t)))
-    value, moved = jax.jvp(lagrangian, (q, qdot, t), (change, rate - qdot * rate_of_time, of_time))
+    value, moved = jax.jvp(scene.lagrangian, (q, qdot, t), (change, rate - qdot * rate_of_time, of_time))
     return moved + value * rate_of_time
 
 

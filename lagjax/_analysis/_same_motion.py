@@ -123,11 +123,8 @@ def _residuals(states: FlatState, *arguments) -> tuple[Array, Array]:
     """Return E (S, n) and the size of its terms (S, n)."""
     scene = SceneState.from_arguments(*arguments)
 
-    def lagrangian(q, qdot, t):
-        return scene.motion.lagrangian(q, qdot, t, scene.numbers)
-
     def equation_and_size(state):
-        rate, by_q = euler_lagrange(lagrangian, state)
+        rate, by_q = euler_lagrange(scene.lagrangian, state)
         force = scene.motion.nonconservative_force(state.q, state.qdot, state.t, scene.numbers)
         return rate - by_q - force, jnp.abs(rate) + jnp.abs(by_q) + jnp.abs(force)
 

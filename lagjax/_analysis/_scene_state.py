@@ -151,6 +151,9 @@ class SceneState(NamedTuple):
 
         return Scales.from_quantities(evaluated, np.asarray(self.q), np.asarray(self.qdot))
 
+    def lagrangian(self, q: Vector, qdot: Vector, t) -> Float[Array, ""]:
+        return self.motion.lagrangian(q, qdot, t, self.numbers)
+
     # ---- quantities at a state (q, q̇) and the time zero ----
 
     def force(self, q: Vector, qdot: Vector) -> Vector:

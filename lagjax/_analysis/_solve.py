@@ -8,6 +8,7 @@ converged.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -92,7 +93,7 @@ def levenberg_marquardt(f: Callable, start: Vector, least: Vector, unit: Vector)
     user's units do not matter. The damping goes down with |r|, which keeps the convergence quadratic where solutions
     are not isolated (Fan & Yuan, Computing 74 (2005) 23).
     """
-    weights = _reciprocal(jnp.sqrt(jnp.sum((jax.jacfwd(f)(start) * unit) ** 2, axis=1)))
+    weights = reciprocal(jnp.sqrt(jnp.sum((jax.jacfwd(f)(start) * unit) ** 2, axis=1)))
 
     def weighted(z):
         return weights * f(z)
@@ -119,7 +120,7 @@ def levenberg_marquardt(f: Callable, start: Vector, least: Vector, unit: Vector)
         damping = jnp.where(ratio > 0.75, damping / 4, jnp.where((ratio < 0.25) | ~better, damping * 4, damping))
         # The most that a step makes of a number of f(z), as a fraction of what the numbers of z make of it.
         of_f, sizes = jnp.abs(jacobian), jnp.maximum(jnp.maximum(least, jnp.abs(z)), jnp.abs(step))
-        length = jnp.max(of_f @ jnp.abs(step) * _reciprocal(of_f @ sizes))
+        length = jnp.max(of_f @ jnp.abs(step) * reciprocal(of_f @ sizes))
         stuck = ~better & ((length < NO_STEP) | ~jnp.isfinite(length))
         moved = jnp.where(better, length, jnp.where(stuck, 0.0, moved))
         return jnp.where(better, z + step, z), jnp.where(better, new, value), moved, damping, scale, count + 1
@@ -152,9 +153,11 @@ STEPS, HALVINGS = 50, 30
 
 def _equilibration_factors(matrix: Matrix) -> tuple[Vector, Vector]:
     """Return factors of the rows and of the columns that scale the largest entry of each to 1; 1 for zero rows."""
-    rows = _reciprocal(jnp.max(jnp.abs(matrix), axis=1))
-    return rows, _reciprocal(jnp.max(jnp.abs(rows[:, None] * matrix), axis=0))
+    rows = reciprocal(jnp.max(jnp.abs(matrix), axis=1))
+    return rows, reciprocal(jnp.max(jnp.abs(rows[:, None] * matrix), axis=0))
 
 
-def _reciprocal(size: Vector) -> Vector:
-    return jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
+def reciprocal(size: Any) -> Any:
+    """Return 1/x of sizes (n,), of NumPy or JAX; 1 where x is zero."""
+    xp = size.__array_namespace__()
+    return xp.where(size > 0, 1 / xp.where(size > 0, size, 1), 1)

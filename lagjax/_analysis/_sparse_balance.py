@@ -17,7 +17,7 @@ from scipy.sparse.linalg import splu
 
 from lagjax._analysis._lowest_modes import Sparse, factorize_regular, lowest_shift
 from lagjax._analysis._scene_state import SceneState
-from lagjax._analysis._solve import DAMPED_STEPS, NO_STEP
+from lagjax._analysis._solve import DAMPED_STEPS, NO_STEP, reciprocal
 from lagjax._equations import sparse_jacobian
 
 Unknowns = Float[np.ndarray, " n+m"]
@@ -81,7 +81,7 @@ def constraints_nearby(scene: SceneState, place: np.ndarray, unit: np.ndarray) -
 def descend(residual: Callable, jacobian_at: Callable, start: Unknowns, least: Unknowns, unit: Unknowns) -> Unknowns:
     """Minimise |f(z)|², f (m,), from `start` (n,) by damped steps, as `_solve.levenberg_marquardt`; return z."""
     z, value, jacobian = start, np.asarray(residual(start)), jacobian_at(start)
-    weights = _reciprocal(_column_lengths(jacobian @ diags_array(unit), 1))
+    weights = reciprocal(_column_lengths(jacobian @ diags_array(unit), 1))
     damping, scale = 0.1, np.zeros(len(z))
     for _ in range(DAMPED_STEPS):
         weighted, error = diags_array(weights) @ jacobian, weights * value
@@ -98,7 +98,7 @@ def descend(residual: Callable, jacobian_at: Callable, start: Unknowns, least: U
         ratio, better = gain / expected if expected > 0 else 0.0, gain > 0 and np.isfinite(new).all()
         damping *= 0.25 if ratio > 0.75 else 4.0 if ratio < 0.25 or not better else 1.0
         change, sizes = abs(weighted) @ np.abs(step / d), np.maximum(np.abs(z), np.abs(step / d))
-        length = np.max(change * _reciprocal(abs(weighted) @ np.maximum(least, sizes)))
+        length = np.max(change * reciprocal(abs(weighted) @ np.maximum(least, sizes)))
         if better:
             z, value, jacobian = z + step / d, new, jacobian_at(z + step / d)
         if not length >= NO_STEP:
@@ -134,10 +134,6 @@ def _damped_solution(matrix: Sparse, b: np.ndarray, damping: float) -> np.ndarra
 
 def _column_lengths(matrix: Sparse, axis: int) -> np.ndarray:
     return np.sqrt((matrix**2).sum(axis=axis))
-
-
-def _reciprocal(x: np.ndarray) -> np.ndarray:
-    return np.where(x > 0, 1 / np.where(x > 0, x, 1), 1)
 
 
 def singular_direction(matrix: Sparse) -> np.ndarray | None:

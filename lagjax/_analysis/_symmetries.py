@@ -236,9 +236,6 @@ def _symmetry_columns(fields: Fields, states: FlatState, *arguments) -> tuple[Ar
     """
     scene = SceneState.from_arguments(*arguments)
 
-    def lagrangian(q, qdot, t):
-        return scene.motion.lagrangian(q, qdot, t, scene.numbers)
-
     def expressions_at(state):
         def expression(weights):
             transform = fields.transform(weights, scene.params)
@@ -247,7 +244,7 @@ def _symmetry_columns(fields: Fields, states: FlatState, *arguments) -> tuple[Ar
 
         none, each = jnp.zeros(fields.count, state.q.dtype), jnp.eye(fields.count, dtype=state.q.dtype)
         of_l, of_others = jax.vmap(jax.linearize(expression, none)[1], out_axes=-1)(each)
-        return of_l, of_others, sum(map(jnp.abs, euler_lagrange(lagrangian, state)))
+        return of_l, of_others, sum(map(jnp.abs, euler_lagrange(scene.lagrangian, state)))
 
     of_l, of_others, terms = jax.lax.map(expressions_at, states)
     size = jnp.sqrt(jnp.nanmean(terms**2, axis=0))[:, None]

@@ -1,4 +1,6 @@
-"""`choose`: which engine integrates a problem. The one place where that is decided; `explain` prints its answer.
+"""`choose`: which engine integrates a problem, the only place that decides it; `explain` prints its answer.
+
+The thresholds between forms of a scene are in `_equations/_form`; `MachineCode.declines` refuses what is sparse.
 
 Without a choice by the user it is machine code where the scene has it, else diffrax with its default solver. A solver,
 fixed steps, an adjoint or a progress meter ask for diffrax; `solver=lagjax.MachineCode()` insists on machine code.

@@ -1,4 +1,5 @@
-"""`Form`: the form in which the equations of a scene are evaluated, and every number that decides between forms.
+"""`Form`: the form in which the equations of a scene are evaluated, and every number that decides between forms, but
+for those of the matrices of sparse scenes (`_sparse`).
 
     form                  by whom                                decided by
     scalar, line          machine code, operation by operation   `derived_form`
@@ -6,7 +7,7 @@
     scalar, registers     a thread of a GPU                      `_native/motions/_gpu`
     scalar                XLA, a program                         `form_in_xla`
     arrays                XLA: M and G as matrices               `form_in_xla`
-    sparse                XLA: products, solved by patterns      `derived_form`
+    sparse                XLA: products, solved by patterns      `derived_form`; `MachineCode.declines` it
 
 `Derivation.form` is the form in which a scene is derived, and known at once. `Derivation.form_in_xla` is what XLA
 compiles of a scene that machine code does not integrate, and known once it is lowered.

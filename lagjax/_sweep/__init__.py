@@ -11,9 +11,9 @@ _description   the scene and the user's functions; their text, by which stores a
 _files         the files of a store
 _batch         a batch of members: their motions, the crossings on the way, what is kept of each
 _job           a store with its functions in a process; the computation of a unit
-_begin         creates a store, or checks the description of an existing one
+_begin         creates a store, or checks that the description of an existing one is the same
 _extend        copies members, or the starts of motions that continue, from another store
-_workers       computes units in this process, and by executors
+_workers       finds the units that are still to be computed, and computes them here or by executors
 _status        the progress of a store
 """
 
@@ -38,14 +38,7 @@ from lagjax._sweep._job import Job, precision
 from lagjax._sweep._members import axes_of
 from lagjax._sweep._statistics import Statistics, Summary, from_bytes, merge, summary
 from lagjax._sweep._status import Progress, Status, status
-from lagjax._sweep._workers import (
-    require_executor,
-    require_part,
-    run_store,
-    submit,
-    units_to_compute,
-    work,
-)
+from lagjax._sweep._workers import require_executor, require_part, run_store, submit, units_to_compute, work
 
 
 @dataclass(frozen=True)

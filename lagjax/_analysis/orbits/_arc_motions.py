@@ -20,15 +20,7 @@ from lagjax._analysis.orbits._jumping_motions import JumpingMotions
 from lagjax._engine import Problem
 from lagjax._engine.taylor import MachineCode, Motions, flow_of, jvp, tolerances_of
 from lagjax._equations import Sample, Scales, has_constraints
-from lagjax._interface import (
-    SUCCESSFUL,
-    Layout,
-    as_arrays,
-    halves,
-    require_concrete,
-    require_finite,
-    require_number,
-)
+from lagjax._interface import SUCCESSFUL, Layout, as_arrays, halves, require_concrete, require_finite, require_number
 from lagjax._primitives import sentence
 from lagjax._run.hybrid import Scene, first_law, jumps, laws, require_scene
 from lagjax._scene import drop_contacts, require_system

@@ -24,7 +24,7 @@ UNCERTAIN = 1e-3
 
 
 class Reduced(NamedTuple):
-    """The arcs restricted to the unknown multipliers, `growth` (K, m, m), and how many multipliers are known: 1."""
+    """The arcs restricted to unknown multipliers, `growth` (K, m, m), and the number of those known to be 1."""
 
     growth: np.ndarray
     known: int

@@ -47,15 +47,7 @@ from lagjax._engine.taylor._state_rates import rate
 from lagjax._engine.taylor._variational import from_rows, to_rows
 from lagjax._interface import SUCCESSFUL, default_platform
 from lagjax._native import Begun, Projection
-from lagjax._primitives import (
-    NOT_EXPORTED,
-    LinearMap,
-    call_host,
-    compute_on_host,
-    cond_alike,
-    cotangent_of,
-    is_zero,
-)
+from lagjax._primitives import NOT_EXPORTED, LinearMap, call_host, compute_on_host, cond_alike, cotangent_of, is_zero
 from lagjax._program import Unlowerable
 from lagjax._tracing import Program
 

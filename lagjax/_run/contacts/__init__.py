@@ -4,7 +4,7 @@
                                           ├─ _contact_search: the events, by loops over numbers, laid out by _places
                                           │    ├─ _law: which contacts push, stick and slide in an impact
                                           │    └─ _scene_code: a scene as the search takes it, and its runs
-                                          ├─ _replay: the same with derivatives;  _impact_law: those of impulses
+                                          ├─ _replay: the same with derivatives;  _impact_derivatives: those of impulses
                                           └─ _corners: where gaps change their direction
 
 A *watch* is a number that stays positive until the state of a contact changes; a *stretch* is the motion between two

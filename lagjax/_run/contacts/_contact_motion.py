@@ -19,7 +19,7 @@ from lagjax._interface import Function, Layout, compile_for_one_call, halves
 from lagjax._program import Unlowerable
 from lagjax._run.contacts._contact_search import LOOPS
 from lagjax._run.contacts._corners import append_sides, corners_of
-from lagjax._run.contacts._impact_law import construct_impulses
+from lagjax._run.contacts._impact_derivatives import construct_impulses
 from lagjax._run.contacts._places import ARRAYS, PLACES
 from lagjax._run.contacts._replay import ContactReplay, Played
 from lagjax._run.jumps import Found, JumpLaw, Mode, SceneCode, mask_rows

@@ -9,6 +9,8 @@ contacts in any state (`InContact`). When a watch becomes negative,
     the slip          it sticks
     μ²λ² − f²         it slides, against the force that held it
 
+The kernel finds the instant (`_native.steps._events`), `find_change` the impulses, `move` the velocities.
+
 A wrong guess is a watch that starts negative, or whose first coefficient above rounding is negative: it falls at once,
 and the next round takes the guess back (`_native.steps._events`). That is Murty's principal pivoting, over series in
 place of numbers (Murty, Linear Algebra Appl. 5 (1972) 65; Heemels, Schumacher & Weiland, ibid. 294 (1999) 93). Bounces

@@ -1,4 +1,4 @@
-"""The law of impacts on numbers: which contacts push, stick or slide, and the impulses (see `_impact_law`).
+"""The law of impacts on numbers: which contacts push, stick or slide, and the impulses (see `_impact_derivatives`).
 
 There are k normal rows, then those of the slips, d for each of r contacts; `size` = k + r d. Flags are doubles, 0 or 1.
 The last argument of a loop is its scratch memory; results are written into array arguments.

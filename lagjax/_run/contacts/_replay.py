@@ -20,7 +20,13 @@ from lagjax._engine.taylor import Line, Surfaces, move_to_zero, run_stretch
 from lagjax._interface import halves
 from lagjax._primitives import differentiable_where, limit_directions
 from lagjax._run.contacts._contact_search import HELD, POISSON
-from lagjax._run.contacts._impact_law import HeldRows, ImpactRows, construct_impulses, find_impulses, rates_behind
+from lagjax._run.contacts._impact_derivatives import (
+    HeldRows,
+    ImpactRows,
+    construct_impulses,
+    find_impulses,
+    rates_behind,
+)
 from lagjax._run.jumps import Replay, SceneCode, join
 
 

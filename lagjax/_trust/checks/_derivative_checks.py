@@ -1,5 +1,7 @@
 """Checks of values and derivatives: finite, and equal to finite differences; if not, which operation is the cause."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from lagjax._equations import describe_pieces, offenders
@@ -16,7 +18,7 @@ _ALL_AT_ONCE = 100
 
 
 def findings(scene: CheckedScene) -> list[Finding]:
-    if reported := _check_values(scene) or _check_finite_derivatives(scene):
+    if reported := [*_check_values(scene)] or [*_check_finite_derivatives(scene)]:
         return reported
     if scene.is_large or scene.layout.size > _ALL_AT_ONCE:
         return _compare_along_lines(scene)
@@ -27,34 +29,28 @@ def findings(scene: CheckedScene) -> list[Finding]:
 # ---- finite ----------------------------------------------------------------------------------------------------------
 
 
-def _check_values(scene: CheckedScene) -> list[Finding]:
-    m, reported = scene.measured, []
-    for role, name, value in (("lagrangian", "L", scene.lagrangian), ("forces", "The force", m.extra),
+def _check_values(scene: CheckedScene) -> Iterator[Finding]:
+    for role, name, value in (("lagrangian", "L", scene.lagrangian), ("forces", "The force", scene.measured.extra),
                               ("dissipation", "D", scene.dissipation)):  # fmt: skip
         if not np.isfinite(value).all():
             where = () if value.ndim == 0 else _select_names(scene.layout.names, ~np.isfinite(value))
             first, of = value[~np.isfinite(value)].ravel()[0], f" of {join_names(where)}" if where else ""
             message = f"{name}{of} is {first} at this state"
-            reported.append(Finding("value_not_finite", "error", where, message + _blame_phrase(scene, role, "value")))
-    return reported
+            yield Finding("value_not_finite", "error", where, message + _blame_phrase(scene, role, "value"))
 
 
-def _check_finite_derivatives(scene: CheckedScene) -> list[Finding]:
+def _check_finite_derivatives(scene: CheckedScene) -> Iterator[Finding]:
     m, n, names = scene.measured, scene.layout.size, scene.names
     first = ~np.isfinite(np.concatenate([m.by_q, m.momentum[0]]))
     drag = ~np.isfinite(m.by_v_of_dissipation)
     second = ~np.isfinite(m.mass[0]).all(axis=1) | ~np.isfinite(scene.drift) & ~drag
-    reported = []
     if first.any():
-        where = _select_names(names[:-1], first)
-        reported.append(_no_derivative(scene, "lagrangian", "The derivative of L by", where, "first"))
+        yield _no_derivative(scene, "lagrangian", "The derivative of L by", _select_names(names[:-1], first), "first")
     elif second.any():
         where = _select_names(names[n:-1], second)
-        reported.append(_no_derivative(scene, "lagrangian", "The second derivative of L by", where, "second"))
+        yield _no_derivative(scene, "lagrangian", "The second derivative of L by", where, "second")
     if drag.any():
-        where = _select_names(names[n:-1], drag)
-        reported.append(_no_derivative(scene, "dissipation", "The derivative of D by", where, "first"))
-    return reported
+        yield _no_derivative(scene, "dissipation", "The derivative of D by", _select_names(names[n:-1], drag), "first")
 
 
 def _no_derivative(scene: CheckedScene, role: str, what: str, where: tuple[str, ...], order: str) -> Finding:
@@ -130,7 +126,7 @@ def _blocks(scene: CheckedScene, round_off):
     return [block for block in blocks if len(block[-1])]
 
 
-def _compare_derivatives(scene: CheckedScene, sides, name, role, derivative, directions, outputs) -> list[Finding]:
+def _compare_derivatives(scene: CheckedScene, sides, name, role, derivative, directions, outputs) -> Iterator[Finding]:
     m, dtype, names = scene.measured, scene.layout.dtype, scene.names
     chosen = np.ix_(directions, range(sides.plus.shape[1]), outputs)
     place = _input_magnitudes(scene)[list(directions)]
@@ -140,14 +136,13 @@ def _compare_derivatives(scene: CheckedScene, sides, name, role, derivative, dir
     )  # fmt: skip
     kinks, n = differ(ahead, behind, dtype), scene.layout.size
     derivative, wrong = derivative.value, differ(derivative, both, dtype) & ~kinks
-    names, reported = [names[i] for i in directions], []
+    names = [names[i] for i in directions]
     for i, k in list(zip(*np.nonzero(kinks), strict=True))[:_SHOWN]:
         of_velocity = name == "L" and directions[i] >= n
         values = behind.value[i, k], ahead.value[i, k], derivative[i, k]
-        reported.append(_kink_finding(scene, name, role, names[i], values, of_velocity))
+        yield _kink_finding(scene, name, role, names[i], values, of_velocity)
     for i, k in list(zip(*np.nonzero(wrong), strict=True))[:_SHOWN]:
-        reported.append(_wrong_derivative_finding(name, names[i], derivative[i, k], both.value[i, k], both.error[i, k]))
-    return reported
+        yield _wrong_derivative_finding(name, names[i], derivative[i, k], both.value[i, k], both.error[i, k])
 
 
 def _kink_finding(scene: CheckedScene, name: str, role: str, along: str, values, of_velocity: bool) -> Finding:

@@ -1,4 +1,4 @@
-"""The law of impacts with derivatives: impulses of contacts that touch, and velocities after them.
+"""Derivatives of the law of impacts. Only derivatives are used: velocities are those of `_contact_search.move`.
 
 With G the rows of k gaps and one-way velocities, and of r d slips, (K, n), q̇⁺ = q̇ + M⁻¹ Gᵀ E Λ, where E adds the
 friction −μ c of a contact that slides to its normal impulse. Newton's law of restitution with Coulomb friction, for all
