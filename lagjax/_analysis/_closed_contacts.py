@@ -17,19 +17,19 @@ from scipy.optimize import nnls
 from lagjax._analysis._scene_state import SceneState
 from lagjax._interface import Layout, accept, is_concrete, restrict_signature
 from lagjax._primitives import nan_unless
-from lagjax._scene import Flat, System, drop_contacts, replace_functions, require_system
+from lagjax._scene import FlatContacts, System, drop_contacts, replace_functions, require_system
 
 # A gap or its rate that is zero, in sizes of its terms: what six digits, or a state in float32, leave of it.
 _CLOSED = 1e-6
 _UNLOADED = 1e-9  # of the largest force: one that is rounding
 
 
-class HeldScene(NamedTuple):
+class ClosedScene(NamedTuple):
     """The scene with the gaps at `places` (c,) as constraints, and the scene with contacts (`given`)."""
 
     system: System
     given: System
-    flat: Flat
+    flat: FlatContacts
     places: tuple[int, ...]
     own: int  # constraints on positions that the scene has besides
 
@@ -101,7 +101,7 @@ def one_sided_reason(what: str) -> str:
     return f"{what} next to a contact without load is linear on one side of it alone."
 
 
-def hold_closed(system: Any, q: PyTree, qdot: PyTree, params: PyTree, what: str) -> HeldScene | None:
+def constrain_closed(system: Any, q: PyTree, qdot: PyTree, params: PyTree, what: str) -> ClosedScene | None:
     """Return the scene with the gaps that are zero at the state as constraints; None if it has no contacts.
 
     Raises `ValueError` if a gap is negative or closes with a velocity, if a closed contact has friction, and if q is
@@ -120,7 +120,7 @@ def hold_closed(system: Any, q: PyTree, qdot: PyTree, params: PyTree, what: str)
     with jax.ensure_compile_time_eval():
         rest = _allowed_velocities(q, qdot)
         layout = Layout.from_state(q, rest)
-        flat = Flat.from_system(system, layout, params)
+        flat = FlatContacts.from_system(system, layout, params)
         at, rate = layout.flatten(q), layout.flatten(rest)
         gaps, slopes = _gaps_and_slopes(flat, at, params)
         rates = slopes @ rate
@@ -142,7 +142,7 @@ def hold_closed(system: Any, q: PyTree, qdot: PyTree, params: PyTree, what: str)
     own = 0 if system.constraints is None else sum(
         leaf.size for leaf in jax.tree.leaves(system._output_shapes("constraints", layout, params))
     )  # fmt: skip
-    return HeldScene(_hold_contacts(system, places), system, flat, places, own)
+    return ClosedScene(_hold_contacts(system, places), system, flat, places, own)
 
 
 def _pressing_shares(jacobian: np.ndarray, force: np.ndarray, rows: np.ndarray) -> np.ndarray | None:
@@ -161,7 +161,7 @@ def _allowed_velocities(q: PyTree, qdot: PyTree) -> PyTree:
     return jax.tree.map(lambda x: jnp.zeros_like(jnp.asarray(x, float)), q) if qdot is None else qdot
 
 
-def _gaps_and_slopes(flat: Flat, q, params: PyTree) -> tuple:
+def _gaps_and_slopes(flat: FlatContacts, q, params: PyTree) -> tuple:
     """Return all gaps (k,) and their gradients (k, n) at q (n,)."""
     time = jnp.zeros((), q.dtype)
     return flat.gaps(q, time, params), jax.jacfwd(flat.gaps)(q, time, params)
@@ -172,7 +172,7 @@ def _gap_sizes(gaps, slopes, q):
     return abs(slopes) @ abs(q) + 1e-8 * (1.0 + abs(gaps))
 
 
-def _require_no_friction(flat: Flat, places: tuple[int, ...], params: PyTree, what: str) -> None:
+def _require_no_friction(flat: FlatContacts, places: tuple[int, ...], params: PyTree, what: str) -> None:
     rough = [k for k in flat.rough.tolist() if k in places]
     if not rough:
         return

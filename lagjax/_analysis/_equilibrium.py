@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 from scipy.sparse import diags_array
 
-from lagjax._analysis._closed_contacts import hold_closed
+from lagjax._analysis._closed_contacts import constrain_closed
 from lagjax._analysis._lowest_modes import Sparse
 from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._solve import is_root, levenberg_marquardt, newton, shortest_preimage
@@ -115,7 +115,7 @@ def equilibrium(
     """
     require_flag(throw, "throw")
     require_flag(stable, "stable")
-    held = hold_closed(system, q, qdot, params, "An equilibrium")
+    held = constrain_closed(system, q, qdot, params, "An equilibrium")
     if held is not None and stable:
         raise ValueError(
             "stable=True is for scenes without contacts: simulate this one with a dissipation until it rests, and give "

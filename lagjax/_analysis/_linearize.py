@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from lagjax._analysis._closed_contacts import HeldScene, hold_closed, one_sided_reason
+from lagjax._analysis._closed_contacts import ClosedScene, constrain_closed, one_sided_reason
 from lagjax._analysis._eigen import tangent_basis
 from lagjax._analysis._equilibrium import least_multipliers
 from lagjax._analysis._scene_state import SceneState, require_matrices
@@ -29,7 +29,15 @@ from lagjax._interface import (
 )
 from lagjax._primitives import accepts_singles, nan_unless
 from lagjax._run import simulate
-from lagjax._scene import Driven, System, asking_for_inputs, drive_scene, held_inputs, push_by_inputs, require_system
+from lagjax._scene import (
+    DrivenParams,
+    System,
+    add_input_forces,
+    constant_inputs,
+    drive_scene,
+    require_system,
+    roles_with_inputs,
+)
 
 Vector = Float[Array, " n"]
 Matrix = Float[Array, "n n"]
@@ -248,8 +256,8 @@ def linearize(
     sensor = None if outputs is None else accept(outputs, "outputs", extras=("t", "params", "inputs"))
     if inputs is not None:
         inputs = _require_inputs(system, sensor, inputs)
-        system, params = drive_scene(system, held_inputs), Driven(params, inputs)
-    if held := hold_closed(system, q, qdot, params, "A linearization"):
+        system, params = drive_scene(system, constant_inputs), DrivenParams(params, inputs)
+    if held := constrain_closed(system, q, qdot, params, "A linearization"):
         system, q = held.system, held.require_loaded(q, qdot, params, one_sided_reason("A motion"))
     scene = SceneState.from_state(system, q, qdot, params)
     scene.require_autonomous("A linearization")
@@ -269,7 +277,7 @@ def _require_inputs(system: System, sensor: Function | None, inputs: PyTree) -> 
     inputs = jax.tree.map(lambda x: 1.0 * x if integers(x) else x, inputs)
     Layout.from_numbers(inputs, "inputs", float)
     require_finite(inputs, "inputs")
-    asking = asking_for_inputs(system)
+    asking = roles_with_inputs(system)
     if not asking and (sensor is None or "inputs" not in sensor.extras):
         raise ValueError(
             "inputs are given, and no function of the scene asks for `inputs`: let forces (or L) do, as "
@@ -292,7 +300,7 @@ def _output_names(sensor: Function, scene: SceneState, driven: bool) -> tuple[st
 
 
 def _outputs(sensor: Function, scene: SceneState, driven: bool, q: Vector, qdot: Vector, params: PyTree) -> PyTree:
-    """Return the outputs in the user's structure; with inputs, `params` are `Driven`."""
+    """Return the outputs in the user's structure; with inputs, `params` are `DrivenParams`."""
     restore, extras = scene.layout.restore, {"inputs": params.inputs} if driven else {}
     return sensor(restore(q), restore(qdot), t=0.0, params=params.params if driven else params, **extras)
 
@@ -352,7 +360,7 @@ def _linearize(of_inputs: Layout | None, sensor: Function | None, *arguments) ->
     return matrices, (*_output_matrices(of_inputs, sensor, scene, u), jnp.hstack(allowed[:2]))
 
 
-def _sample(scene: SceneState, held: HeldScene | None, of_inputs: Layout | None, dt) -> tuple[Array, Array]:
+def _sample(scene: SceneState, held: ClosedScene | None, of_inputs: Layout | None, dt) -> tuple[Array, Array]:
     """Return Φ (2n, 2n) and Γ (2n, m); raise `ValueError` if the motion over dt fails.
 
     Contacts that are open at the state may close within dt: the motion is that with them.
@@ -364,8 +372,8 @@ def _sample(scene: SceneState, held: HeldScene | None, of_inputs: Layout | None,
     system, params = given if held is None or not held.places else scene.system, scene.params
     if of_inputs is None:  # u are generalised forces
         none = scene.layout.restore(jnp.zeros_like(scene.q))
-        given, system = (drive_scene(push_by_inputs(x), held_inputs) for x in (given, system))
-        params, of_inputs = Driven(params, none), scene.layout
+        given, system = (drive_scene(add_input_forces(x), constant_inputs) for x in (given, system))
+        params, of_inputs = DrivenParams(params, none), scene.layout
     state = scene.layout, scene.q, scene.qdot, params
     phi, gamma = _flow_derivatives(of_inputs, dt, system, *state)
     if held is not None and held.places:
@@ -392,7 +400,7 @@ def _require_same_end(dt, given: System, system: System, state: tuple, sampled: 
 
 
 @eqx.filter_jit
-def _compare_ends(dt, given: System, system: System, layout: Layout, q, qdot, params: Driven) -> Array:
+def _compare_ends(dt, given: System, system: System, layout: Layout, q, qdot, params: DrivenParams) -> Array:
     """True if the motion over dt with contacts ends in the same state as with the closed ones as constraints."""
     ts = jnp.stack([jnp.zeros((), q.dtype), jnp.asarray(dt, q.dtype)])
     start = layout.restore(q), layout.restore(qdot)
@@ -405,7 +413,7 @@ def _compare_ends(dt, given: System, system: System, layout: Layout, q, qdot, pa
 
 
 @eqx.filter_jit
-def _flow_derivatives(of_inputs: Layout, dt, system: System, layout: Layout, q, qdot, params: Driven):
+def _flow_derivatives(of_inputs: Layout, dt, system: System, layout: Layout, q, qdot, params: DrivenParams):
     """Return the derivatives of the state (2n,) after dt by the one before, and by constant inputs."""
 
     def follow(q, qdot, u):

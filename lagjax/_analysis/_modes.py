@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 from scipy.sparse import csr_array, diags_array
 
-from lagjax._analysis._closed_contacts import hold_closed, one_sided_reason
+from lagjax._analysis._closed_contacts import constrain_closed, one_sided_reason
 from lagjax._analysis._eigen import exponents_and_modes, symmetric_modes, tangent_basis
 from lagjax._analysis._equilibrium import require_steady
 from lagjax._analysis._linearize import steady_matrices
@@ -130,7 +130,7 @@ def normal_modes(
     """
     if count is not None and (type(count) is not int or count < 1):
         raise ValueError(f"count must be a positive integer, or None for all modes; got {count!r}.")
-    if held := hold_closed(system, q, qdot, params, "A normal mode"):
+    if held := constrain_closed(system, q, qdot, params, "A normal mode"):
         system, q = held.system, held.require_loaded(q, qdot, params, one_sided_reason("A small oscillation"))
     scene = SceneState.from_state(system, q, qdot, params, sparse=True)
     scene.require_autonomous("A normal mode")

@@ -1,6 +1,6 @@
 """The contacts of a scene in flat coordinates: gaps ≥ 0, one-way velocities ≥ 0, their friction, and their state.
 
-One compiled program serves all combinations of closed and sticking contacts: the combination is data (`InContact`).
+One compiled program serves all combinations of closed and sticking contacts: the combination is data (`ContactParams`).
 With gaps g, one-way velocities γ and slips s, the program has a row of the constraint matrix for each of
 
 closed: g = 0, γ = 0 open: λ = 0 sticks: s = 0 slides: f = −μ λ c, c the direction of s
@@ -42,7 +42,7 @@ class Contacts(NamedTuple):
     near: Any
 
 
-class InContact(NamedTuple):
+class ContactParams(NamedTuple):
     """Parameters (params of the user, contacts): of a program that integrates a system with contacts."""
 
     params: PyTree
@@ -50,7 +50,7 @@ class InContact(NamedTuple):
 
 
 class ContactScene(eqx.Module):
-    """A scene with parameters `InContact`, whose closed contacts are constraints, as machine code integrates it.
+    """A scene that takes `ContactParams`; its closed contacts are constraints, as machine code integrates it.
 
     With `is_open` all contacts are taken as open, whatever the parameters say. With `slots` = (gaps, velocities) the
     constraint matrix has only this many rows, which `Contacts.held` selects: a body is held by few independent rows,
@@ -65,9 +65,12 @@ class ContactScene(eqx.Module):
     def path(self) -> str:
         return "array" if self.system.path == "array" else "scalar"  # arrays do not jump, however large the scene is
 
-    def _motion(self, layout: Layout, params: InContact) -> Motion:
+    def _motion(self, layout: Layout, params: ContactParams) -> Motion:
         """Return the equations of motion with the contacts in the state `params.contacts`."""
-        free, flat = self.system._motion(layout, params.params), Flat.from_system(self.system, layout, params.params)
+        free, flat = (
+            self.system._motion(layout, params.params),
+            FlatContacts.from_system(self.system, layout, params.params),
+        )
         own = free.constraints
 
         def ask_user(function: Callable | None):
@@ -92,7 +95,7 @@ class ContactScene(eqx.Module):
 
         return couple_forces(motion, law, layout, params)
 
-    def _hold_contacts(self, own: Constraints, flat: "Flat", layout: Layout) -> Constraints:
+    def _hold_contacts(self, own: Constraints, flat: "FlatContacts", layout: Layout) -> Constraints:
         """Return the system's own constraints, followed by the rows of the contacts, with the friction forces."""
 
         def held_positions(q, t, p):
@@ -127,7 +130,7 @@ class ContactScene(eqx.Module):
         drags = drag if flat.rough.size else None, flat.shapes.directions > 1
         return Constraints(held_positions, held_velocities, held, *drags)
 
-    def split_forces(self, flat: "Flat", forces, positions: int, p: InContact) -> tuple:
+    def split_forces(self, flat: "FlatContacts", forces, positions: int, p: ContactParams) -> tuple:
         """Split the multipliers, `positions` of them on positions: own constraints, normals (k,), slips (r, d)."""
         one_way, (r, d) = flat.shapes.count - flat.gap_count, (flat.rough.size, flat.shapes.directions)
         gaps, velocities = (flat.gap_count, one_way + r * d) if self.slots is None else self.slots
@@ -138,7 +141,7 @@ class ContactScene(eqx.Module):
             normal, along = normal @ of_gaps, along @ of_velocities
         return own, jnp.append(normal, along[:one_way]), along[one_way:].reshape(r, d)
 
-    def rows(self, flat: "Flat", p: InContact) -> list:
+    def rows(self, flat: "FlatContacts", p: ContactParams) -> list:
         """Return two 0/1 matrices (slots, rows): which row of gaps, and which of velocities, each slot takes."""
         assert self.slots is not None
         found = []
@@ -148,17 +151,17 @@ class ContactScene(eqx.Module):
         return found
 
 
-def _row_counts(own: Constraints, layout: Layout, p: InContact) -> tuple[int, int]:
+def _row_counts(own: Constraints, layout: Layout, p: ContactParams) -> tuple[int, int]:
     """Return the numbers of the system's own position constraints and velocity constraints."""
     q, t = jnp.zeros(layout.size, layout.dtype), jnp.zeros((), layout.dtype)
     f = jax.eval_shape(own.f, q, t, p.params).size
     return f, jax.eval_shape(own.a, q, q, t, p.params).size
 
 
-class Flat(NamedTuple):
+class FlatContacts(NamedTuple):
     """The contact functions in flat coordinates: each takes (q, [qdot,] t, params), with arrays for params."""
 
-    shapes: "Shapes"
+    shapes: "ContactShapes"
     gaps: Callable
     one_way: Callable
     slips: Callable  # (r, d)
@@ -174,8 +177,11 @@ class Flat(NamedTuple):
         return self.shapes.rough
 
     @classmethod
-    def from_system(cls, system: System, layout: Layout, params: PyTree) -> "Flat":
-        code, shapes = eqx.filter(params, eqx.is_array_like, inverse=True), Shapes.from_system(system, layout, params)
+    def from_system(cls, system: System, layout: Layout, params: PyTree) -> "FlatContacts":
+        code, shapes = (
+            eqx.filter(params, eqx.is_array_like, inverse=True),
+            ContactShapes.from_system(system, layout, params),
+        )
 
         def call(role: str, vectors, t, numbers):
             function, whole = getattr(system, role), eqx.combine(numbers, code)
@@ -212,7 +218,7 @@ class Flat(NamedTuple):
         held = contacts.closed[self.rough] * contacts.sticks
         return jnp.broadcast_to(held[:, None], (held.size, self.shapes.directions)).ravel()
 
-    def slip_direction(self, q, qdot, t, p: InContact):
+    def slip_direction(self, q, qdot, t, p: ContactParams):
         """Return the unit vectors (r, d) along the slips; of slips at rest, along `Contacts.direction`."""
         given = p.contacts.direction
         if self.shapes.directions == 1:
@@ -222,7 +228,7 @@ class Flat(NamedTuple):
         aside = jnp.stack([-unit[:, 1], unit[:, 0]], axis=1)
         return (unit + turn[:, None] * aside) / jnp.sqrt(1.0 + turn * turn)[:, None]
 
-    def turning_slips(self, q, qdot, t, p: InContact) -> tuple:
+    def turning_slips(self, q, qdot, t, p: ContactParams) -> tuple:
         """Return in space `direction` as unit vectors (r, 2), and the slips (r,) along and across them."""
         given, slips = p.contacts.direction, self.slips(q, qdot, t, p.params)
         length = jnp.sqrt((given * given).sum(1))
@@ -230,7 +236,7 @@ class Flat(NamedTuple):
         return unit, (slips * unit).sum(1) + length, slips[:, 1] * unit[:, 0] - slips[:, 0] * unit[:, 1]
 
 
-class Shapes(NamedTuple):
+class ContactShapes(NamedTuple):
     """The structure of a system's k contacts, of which the first `of_gaps` are gaps and the others one-way velocities.
 
     `rough` (r,) are the indices of those with friction, with slips in `directions` dimensions; `names` (k,) are all
@@ -246,7 +252,7 @@ class Shapes(NamedTuple):
 
     @staticmethod
     @once_for_structure
-    def from_system(system: System, layout: Layout, params: PyTree) -> "Shapes":
+    def from_system(system: System, layout: Layout, params: PyTree) -> "ContactShapes":
         """Trace the contact functions; raise `TypeError` or `ValueError` if one returns the wrong structure."""
         trees = [
             None if getattr(system, role) is None else system._output_shapes(role, layout, params)
@@ -260,7 +266,7 @@ class Shapes(NamedTuple):
             raise ValueError("contacts, or one_way, returns no number: it must return the gaps that stay >= 0.")
         names = system.contact_names(layout, params)
         rough, directions = _friction_directions(system, layout, params, trees[0])
-        shapes = Shapes(tuple(trees), counts[0], sum(counts), rough, directions, names)
+        shapes = ContactShapes(tuple(trees), counts[0], sum(counts), rough, directions, names)
         numbers, code = eqx.partition(params, eqx.is_array_like)
         for role in ("restitution", "friction"):
             function = getattr(system, role)

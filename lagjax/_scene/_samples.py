@@ -161,7 +161,7 @@ def _mean_spacing(first, last, count: int) -> tuple:
     return mean, _UNEVEN * mean + 4 * eps * (abs(first) + abs(last))
 
 
-def continued(values: np.ndarray, count: int, hold: str) -> np.ndarray:
+def append_samples(values: np.ndarray, count: int, hold: str) -> np.ndarray:
     """Return `count` samples (count, …) to append to `values` (K, …), which keep the function on the given knots.
 
     A parabola for "cubic", the reflection for "band" (of 16 samples at least), else the last sample.

@@ -16,7 +16,7 @@ from lagjax._equations import Derivation, derivation_of
 from lagjax._interface import VERSION, Layout, number_names
 from lagjax._native import CNumbers, write_function
 from lagjax._program import Graph, StraightLine, Unlowerable, eliminate_dead_code
-from lagjax._scene import Driven, drive_scene, held_inputs
+from lagjax._scene import DrivenParams, constant_inputs, drive_scene
 from lagjax._tracing import Program, fold, lower_formula, stack
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def write_c(system: "System", layout: Layout, params: PyTree, inputs: PyTree, na
         )
     places = {"q": layout.names, "params": number_names(params, "params"), "inputs": number_names(inputs, "inputs")}
     if inputs is not None:
-        system, params = drive_scene(system, held_inputs), Driven(params, inputs)
+        system, params = drive_scene(system, constant_inputs), DrivenParams(params, inputs)
     try:
         derivation = derivation_of(system, layout, params).with_numbers().lowered
         return _SceneSource(derivation, name, CNumbers(dtype), places).text()

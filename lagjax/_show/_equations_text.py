@@ -9,7 +9,7 @@ from jaxtyping import PyTree
 from lagjax._equations import derivation_of
 from lagjax._interface import Layout, number_names, show_str
 from lagjax._program import Formulas, Unlowerable
-from lagjax._scene import Driven, drive_scene, held_inputs
+from lagjax._scene import DrivenParams, constant_inputs, drive_scene
 from lagjax._show._formula_text import LATEX, PYTHON, FormulaWriter, Name, input_names, shared_parts, short_names
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def write_equations(system: "System", layout: Layout, params: PyTree, inputs: Py
     names = system.constraint_names(layout, params) if system.constraints or system.velocity_constraints else []
     numbers = [*number_names(params, "params"), *number_names(inputs, "inputs")]
     if inputs is not None:
-        system, params = drive_scene(system, held_inputs), Driven(params, inputs)
+        system, params = drive_scene(system, constant_inputs), DrivenParams(params, inputs)
     quantities = ("mass_matrix", "force", "residual", "jacobian", "gamma")
     try:
         derivation = derivation_of(system, layout, params)

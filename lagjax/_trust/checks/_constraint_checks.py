@@ -8,7 +8,7 @@ import numpy as np
 
 from lagjax._equations import ROUNDINGS, dependent_rows, require_consistent
 from lagjax._interface import Layout, join_names
-from lagjax._scene import Flat
+from lagjax._scene import FlatContacts
 from lagjax._trust.checks._findings import Finding
 from lagjax._trust.checks._mass import null_velocities
 from lagjax._trust.checks._scene_at_start import CheckedScene
@@ -99,7 +99,7 @@ def contact_findings(scene: CheckedScene) -> Iterator[Finding]:
     if scene.system.contacts is None:
         return
     (q, qdot, t, numbers), layout = scene.state, scene.layout
-    flat = Flat.from_system(scene.system, layout, scene.arguments[3])
+    flat = FlatContacts.from_system(scene.system, layout, scene.arguments[3])
     gaps, rates = jax.jvp(lambda q, t: flat.gaps(q, t, numbers), (q, t), (qdot, jnp.ones_like(t)))
     slopes = jax.jacfwd(lambda q: flat.gaps(q, t, numbers))(q)
     gaps, rates, slopes = (np.asarray(x) for x in (gaps, rates, slopes))

@@ -37,7 +37,7 @@ from lagjax._interface import RESULTS, Layout, advice, is_concrete, name_of, sho
 from lagjax._run import Members
 from lagjax._scene import System
 from lagjax._trust._diagnosis import diagnosis, motion_end
-from lagjax._trust.health._border_counts import Met, count_borders, is_piecewise
+from lagjax._trust.health._border_counts import BorderCounts, count_borders, is_piecewise
 from lagjax._trust.health._global_error import global_error
 from lagjax._trust.health._measurements import SLACK, SMALLEST, VISIBLE, Extreme, does_work, measure_trajectory
 
@@ -100,12 +100,12 @@ def _shared_impacts(trajectory) -> tuple:
     return jnp.sum(shared, axis=-1), jnp.nanmin(jnp.where(shared, t, jnp.nan), axis=-1)
 
 
-def _borders(trajectory) -> tuple[bool, Met | None]:
+def _borders(trajectory) -> tuple[bool, BorderCounts | None]:
     """Return `count_borders` with the batch axes of the trajectory; None for a piecewise scene that is traced."""
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
         members = Members(trajectory)
         located, counts = count_borders(members)
-        return located, counts and Met(*(jnp.asarray(np.reshape(x, members.batch)) for x in counts))
+        return located, counts and BorderCounts(*(jnp.asarray(np.reshape(x, members.batch)) for x in counts))
     system, piecewise = trajectory.system, []
     if not isinstance(system, System):
         return True, None
@@ -117,7 +117,7 @@ def _borders(trajectory) -> tuple[bool, Met | None]:
 
     zero = trajectory.map_members(none)
     located = trajectory.engine == "MachineCode" or not piecewise[0]
-    return located, None if piecewise[0] else Met(zero, zero, zero, jnp.full(zero.shape, jnp.nan))
+    return located, None if piecewise[0] else BorderCounts(zero, zero, zero, jnp.full(zero.shape, jnp.nan))
 
 
 class Health(eqx.Module):
@@ -190,7 +190,7 @@ class Health(eqx.Module):
     gradients_finite: Bool[Array, "*batch"]
     gradients_time: Float[Array, "*batch"]
     global_error: Extreme | None
-    borders: Met | None
+    borders: BorderCounts | None
     guards: tuple[Bool[Array, "*batch"], Bool[Array, "*batch"]] | None
     impacts: tuple[Int[Array, "*batch"], Float[Array, "*batch"], Int[Array, "*batch"], Float[Array, "*batch"]] | None
     doubts: tuple[Int[Array, "*batch 3"], Float[Array, "*batch 3"]] | None

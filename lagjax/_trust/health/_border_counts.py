@@ -21,7 +21,7 @@ from lagjax._trust.health._measurements import path_of
 LARGEST_COUNTED = 2**22  # numbers of steps that are written down at once
 
 
-class Met(NamedTuple):
+class BorderCounts(NamedTuple):
     """Counts, (N,) each, of how often a member crossed a border, began to slide along one, and grazed one."""
 
     crossed: Any
@@ -30,13 +30,13 @@ class Met(NamedTuple):
     t: Any  # when it first grazed one, NaN where it did not
 
 
-def count_borders(members: Members) -> tuple[bool, Met | None]:
-    """Return whether steps ended at the borders of the scene, and the counts `Met`; None if not known."""
+def count_borders(members: Members) -> tuple[bool, BorderCounts | None]:
+    """Return whether steps ended at the borders of the scene, and the counts `BorderCounts`; None if not known."""
     trajectory = members.trajectory
     if not isinstance(trajectory.system, System):  # modes have transitions for that
         return True, None
     crossed, slid, grazed = (np.zeros(members.count, int) for _ in range(3))
-    nothing = Met(crossed, slid, grazed, np.full(members.count, np.nan))
+    nothing = BorderCounts(crossed, slid, grazed, np.full(members.count, np.nan))
     if not is_piecewise(trajectory.system, members.layout, members.params):
         return True, nothing
     if trajectory.engine != "MachineCode" or trajectory.tolerances is None:
@@ -68,7 +68,7 @@ def is_piecewise(system: System, layout: Layout, params) -> bool:
         return bool(pieces_of_motion(derivation.motion, *derivation.state_shapes))
 
 
-def _count_contacts(flow: Flow, ts, y0, params, tolerances: Tolerances, steps, places, into: Met) -> None:
+def _count_contacts(flow: Flow, ts, y0, params, tolerances: Tolerances, steps, places, into: BorderCounts) -> None:
     """Integrate some motions, and add their counts to `into` at their `places`, in place."""
     borders = flow.kernel.borders
     assert borders is not None  # without a series there are none, and none are counted
