@@ -269,7 +269,7 @@ def fall(q, qdot):
     return 0.5 * qdot**2 - 9.81 * q
 
 
-def push_by_inputs(damped):
+def add_input_forces(damped):
     return lambda q, qdot, params, inputs: params["gain"] * inputs - damped * params["c"] * qdot
 
 
@@ -312,7 +312,7 @@ def test_motion_that_jumps_is_driven_by_samples(build, begin, change, ts, truth,
         for k, start in enumerate(((begin, 0.0), lagjax.Guess(0.95 * begin, 0.1)))
     ]
     free = dict.fromkeys({"c": 0.0} | params0, True) | {"c": "c" in truth}
-    fit = lagjax.fit(build(push_by_inputs), rows, {"c": 0.0} | params0, free=free)
+    fit = lagjax.fit(build(add_input_forces), rows, {"c": 0.0} | params0, free=free)
     low, high = fit.intervals(0.999)
     assert fit.ok and all(low[key] < value < high[key] for key, value in truth.items())
     assert fit.starts[1][0] == pytest.approx(begin, abs=2e-3)

@@ -10,7 +10,7 @@ import pytest
 from scenes import BALL, HILL, VALLEY
 
 import lagjax
-from lagjax._engine import End, what_stopped
+from lagjax._engine import End, find_stop_flags
 
 TS = np.linspace(0.0, 2.0, 5)
 BUDGET = {"max_steps": 2000}
@@ -57,7 +57,7 @@ def names(result):
     "solver",
     [pytest.param(None, id="machine code"), pytest.param(diffrax.Tsit5(), id="diffrax", marks=pytest.mark.slow)],
 )
-def test_members_are_named_by_what_stopped_them(solver):
+def test_members_are_named_by_find_stop_flags_them(solver):
     batch = lagjax.simulate_batch(SCENE, Q0, 0 * Q0, TS, PARAMS, batch_axes=(0, 0, 0), solver=solver, **BUDGET)
     found = names(batch.result)
     if solver is not None and found[2] == "max_steps_reached":  # its steps, too, are far longer than from jump to jump
@@ -216,7 +216,7 @@ STOPPED = {
 
 
 @pytest.mark.parametrize("name", STOPPED)
-def test_what_stopped(name):
+def test_find_stop_flags(name):
     function, ends, jumps = STOPPED[name]
     one, count = np.ones(2), np.full(2, 50)
 
@@ -225,7 +225,7 @@ def test_what_stopped(name):
 
     at = End(one, np.array([[0.0, 1.0]] * 2), 0 * one, 2 * one, count, count)
     shrank = np.array([True, False])
-    not_finite, jumped = what_stopped(acceleration, at, shrank, ~shrank)
+    not_finite, jumped = find_stop_flags(acceleration, at, shrank, ~shrank)
     assert not_finite.tolist() == [ends, False], "a spent budget does not ask what lies ahead"
     near = not (name == "a step of time")  # beyond the smallest steps
     assert jumped.tolist() == [jumps and near, jumps]

@@ -112,7 +112,7 @@ def _check_inputs(layout: Layout, q, qdot, t, params) -> Iterator[Finding]:
 
 
 def _check_small_coordinates(layout: Layout, q) -> list[Finding]:
-    """Advice where an array of coordinates is so small beside another one that the default atol loses its digits."""
+    """Return advice if an array of coordinates is so small beside another that the default atol is too coarse."""
     rtol, eps = DEFAULT_RTOL, float(np.finfo(layout.dtype).eps)
     paths = jax.tree_util.tree_leaves_with_path(q)
     leaves = {"q" + jax.tree_util.keystr(path): float(np.abs(np.asarray(leaf)).max(initial=0)) for path, leaf in paths}
@@ -159,7 +159,7 @@ def _check_precision(layout: Layout, q, qdot, params) -> Iterator[Finding]:
 
 
 def _check_dissipation(scene: CheckedScene) -> list[Finding]:
-    """A warning where the dissipation function puts energy into the motion at some velocity."""
+    """Return a warning if the dissipation function adds energy to the motion at some velocity."""
     power, size = scene.measured.power.T
     usable = np.isfinite(power)
     gains = power < -np.sqrt(np.finfo(scene.layout.dtype).eps) * size

@@ -1,5 +1,4 @@
-"""Constraints and contacts: whether constraints are satisfied, and whether one follows from others; whether the motion
-starts inside a contact, or moves into one that is closed; and whether each has a gradient."""
+"""Checks of constraints and contacts: satisfied, independent, with a gradient, and not violated at the start."""
 
 from collections.abc import Iterator
 
@@ -9,7 +8,7 @@ import numpy as np
 
 from lagjax._equations import ROUNDINGS, dependent_rows, require_consistent
 from lagjax._interface import Layout, join_names
-from lagjax._scene import Flat
+from lagjax._scene import FlatContacts
 from lagjax._trust.checks._findings import Finding
 from lagjax._trust.checks._mass import null_velocities
 from lagjax._trust.checks._scene_at_start import CheckedScene
@@ -50,7 +49,7 @@ def _check_finite(name: str, value) -> Finding:
 
 
 def _check_zero_gradients(name: str, of_velocities: bool, value, rows: np.ndarray) -> Finding:
-    """A constraint whose gradient is zero: of no use here, and often an inequality or a square."""
+    """Return the finding for a constraint with zero gradient, which is often an inequality or a square."""
     if of_velocities:
         message = (
             f"{name} does not depend on qdot here, so that no force can keep it. Give what depends on q alone as "
@@ -72,7 +71,7 @@ def _check_zero_gradients(name: str, of_velocities: bool, value, rows: np.ndarra
 
 
 def _check_affine(names, jacobian, positions: int, layout: Layout) -> Iterator[Finding]:
-    """Warnings where ∂a/∂q̇ changes with q̇; the last half of the states differs from the state itself in q̇ alone."""
+    """Yield warnings where ∂a/∂q̇ changes with q̇; the last half of the sampled states differs in q̇ alone."""
     for k in range(positions, len(names)):
         others = jacobian[(len(jacobian) + 1) // 2 :, k]
         others = others[np.isfinite(others).all(axis=1)]
@@ -86,7 +85,7 @@ def _check_affine(names, jacobian, positions: int, layout: Layout) -> Iterator[F
 
 
 def _check_independent(schur: np.ndarray, names: list[str]) -> Iterator[Finding]:
-    """Advice for each constraint that is a combination of others, from the Schur complement (m, m)."""
+    """Yield advice for each constraint that depends linearly on others, from the Schur complement (m, m)."""
     for row, factors in dependent_rows(schur).items():
         others = tuple(name for name, factor in zip(names, factors, strict=True) if factor)
         message = (
@@ -100,7 +99,7 @@ def contact_findings(scene: CheckedScene) -> Iterator[Finding]:
     if scene.system.contacts is None:
         return
     (q, qdot, t, numbers), layout = scene.state, scene.layout
-    flat = Flat.from_system(scene.system, layout, scene.arguments[3])
+    flat = FlatContacts.from_system(scene.system, layout, scene.arguments[3])
     gaps, rates = jax.jvp(lambda q, t: flat.gaps(q, t, numbers), (q, t), (qdot, jnp.ones_like(t)))
     slopes = jax.jacfwd(lambda q: flat.gaps(q, t, numbers))(q)
     gaps, rates, slopes = (np.asarray(x) for x in (gaps, rates, slopes))

@@ -1,4 +1,4 @@
-"""Values and derivatives: finite, and what finite differences say; where not, which operation is to blame."""
+"""Checks of values and derivatives: finite, and equal to finite differences; if not, which operation is the cause."""
 
 from collections.abc import Iterator
 
@@ -79,7 +79,7 @@ _BRANCH = (
 
 
 def _blame_phrase(scene: CheckedScene, role: str, order: str) -> str:
-    """The end of a sentence: which operation, with which operands, in which line, and what to write instead."""
+    """Return the end of a sentence: the operation, its operands, its line of code, and what to write instead."""
     wanted = {"value": ("value",), "first": ("value", "first derivative")}.get(order)
     offending = [
         o for o in offenders(getattr(scene.written_motion, role), *scene.state) if not wanted or o.fault in wanted
@@ -96,8 +96,10 @@ def _blame_phrase(scene: CheckedScene, role: str, order: str) -> str:
 
 
 def _blocks(scene: CheckedScene, round_off):
-    """Blocks to compare: name, role, derivatives (directions, outputs), and which of the 2n + 1 directions and of the
-    outputs of `Measured.here` these are."""
+    """Return the derivatives to compare: (name, role, derivatives (directions, outputs), directions, outputs).
+
+    Directions index the 2n + 1 inputs (q, q̇, t), outputs index `Measured.here`.
+    """
     m, n = scene.measured, scene.layout.size
     first, dissipates = 1 + n, scene.motion.dissipation is not None
     constraint = first + dissipates
@@ -144,7 +146,7 @@ def _compare_derivatives(scene: CheckedScene, sides, name, role, derivative, dir
 
 
 def _kink_finding(scene: CheckedScene, name: str, role: str, along: str, values, of_velocity: bool) -> Finding:
-    """The finding for slopes below and above the state that differ; `values` are these and the derivative."""
+    """Return the finding for different slopes below and above the state; `values` are these and the derivative."""
     below, above, derivative = values
     slope = f"The slope of {name} along {along} is {below:.6g} below this state and {above:.6g} above it"
     if role in ("lagrangian", "dissipation"):
@@ -186,7 +188,7 @@ _OF_LINES = (
 
 
 def _compare_along_lines(scene: CheckedScene) -> list[Finding]:
-    """Findings where derivatives are not the slopes along random directions of all coordinates or velocities."""
+    """Return findings where derivatives differ from slopes along random directions in q or in q̇."""
     # What is compared is a sum over all outputs of a function. A second look leaves out what the first one blames.
     n, reported = scene.layout.size, {}
     directions = np.zeros((2 * _LINES + 1, 2 * n + 1))
@@ -207,7 +209,7 @@ def _compare_along_lines(scene: CheckedScene) -> list[Finding]:
 
 
 def _blamed_coordinate(scene: CheckedScene, direction: np.ndarray, k: int) -> int | None:
-    """The place that is off by itself along a direction, by halves; None where the sum alone is off, by rounding."""
+    """Return by bisection the coordinate whose own derivative is wrong along a direction; None if there is none."""
     part = np.flatnonzero(direction)
     while len(part) > 1:
         halves = part[: len(part) // 2], part[len(part) // 2 :]
@@ -230,7 +232,7 @@ def _restrict(direction: np.ndarray, part) -> np.ndarray:
 
 
 def _off_line(scene: CheckedScene, direction: np.ndarray) -> tuple[np.ndarray, Slopes, Slopes, Slopes, np.ndarray]:
-    """Flags (2, 5) of kinks and wrong derivatives along a direction, slopes on both and on each side, derivatives."""
+    """Return flags (2, 5) of kinks and wrong derivatives along a direction; both, one-sided slopes; derivatives."""
     n, dtype = scene.layout.size, scene.layout.dtype
     steps = ladder(np.array([scene.sizes[-1] if direction[-1] else 1.0]), dtype)
     line, eps = scene.line(direction, steps[:, 0]), float(np.finfo(dtype).eps)
@@ -245,7 +247,7 @@ def _off_line(scene: CheckedScene, direction: np.ndarray) -> tuple[np.ndarray, S
 
 
 def _input_magnitudes(scene: CheckedScene) -> np.ndarray:
-    """|q|, |q̇| and the time, (2n + 1,): the numbers of the state whose rounding moves what is computed from them."""
+    """Return |q|, |q̇| and the time, (2n + 1,): magnitudes that determine the rounding error of results."""
     q, v, t = (np.abs(np.asarray(x, float)) for x in scene.state[:3])
     speed = v.max()
     return np.concatenate([q, v, [max(t, q.max() / speed if speed > 0 else 0)]])
