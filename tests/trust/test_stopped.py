@@ -57,7 +57,7 @@ def names(result):
     "solver",
     [pytest.param(None, id="machine code"), pytest.param(diffrax.Tsit5(), id="diffrax", marks=pytest.mark.slow)],
 )
-def test_members_are_named_by_find_stop_flags_them(solver):
+def test_members_are_named_by_what_stopped_them(solver):
     batch = lagjax.simulate_batch(SCENE, Q0, 0 * Q0, TS, PARAMS, batch_axes=(0, 0, 0), solver=solver, **BUDGET)
     found = names(batch.result)
     if solver is not None and found[2] == "max_steps_reached":  # its steps, too, are far longer than from jump to jump
@@ -216,7 +216,7 @@ STOPPED = {
 
 
 @pytest.mark.parametrize("name", STOPPED)
-def test_find_stop_flags(name):
+def test_what_stopped(name):
     function, ends, jumps = STOPPED[name]
     one, count = np.ones(2), np.full(2, 50)
 
