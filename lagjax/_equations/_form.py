@@ -69,11 +69,12 @@ LARGEST_COMPILED = 100
 # those of arrays 2 s for what is vectorised, as 60 bodies are (39 000: 4 s), and 13 s for an arm that is written joint
 # by joint (7600: 1 s). Doubled, the first kind loses 3 s more; halved, arms of 12 joints compile for half a minute.
 LARGEST_DIFFERENTIATED = 30_000
-# Operations of all quantities, and of these for each equation that JAX writes the scene in, beyond which JAX does so
-# too. Arrays take 1 to 2 s however long they are: the gradient of an acceleration with a network 2 × 32 in L (4600
-# operations, 33 equations) takes 0.8 s, by programs 2.6; of a chain of 32 (4200, 21) 2.2 and 2.6; 24 coordinates joint
-# by joint (15 100, 1846) 3.6 by programs.
-LEAST_AS_ARRAYS, MOST_OF_EQUATION = 3000, 100
+# Operations of all quantities, of these for each equation that JAX writes the scene in, and for each coordinate, beyond
+# all of which JAX does so too. Arrays take 1 to 2 s however long they are: the gradient of an acceleration with a
+# network 2 × 32 in L (4600 operations, 33 equations) takes 0.8 s, by programs 2.6; 24 coordinates joint by joint
+# (15 100, 1846) 3.6 by programs. What has few operations for each coordinate has a mass matrix that arrays solve for:
+# an acceleration of 20 bodies (4600, 29) takes 300 µs by arrays, and 2 by programs.
+LEAST_AS_ARRAYS, MOST_OF_EQUATION, MOST_OF_COORDINATE = 3000, 100, 1000
 
 # ---- analysis and checks ---------------------------------------------------------------------------------------------
 
@@ -145,7 +146,7 @@ def suits_programs(derivation: "Derivation", operations: int) -> bool:
     """True if derivatives are quicker by programs, of this many operations, than by the functions as written."""
     if operations <= LEAST_AS_ARRAYS or operations > LARGEST_DIFFERENTIATED:
         return operations <= LEAST_AS_ARRAYS
-    return operations <= MOST_OF_EQUATION * derivation.equations
+    return operations <= max(MOST_OF_EQUATION * derivation.equations, MOST_OF_COORDINATE * derivation.layout.size)
 
 
 def form_in_xla(derivation: "Derivation") -> Form:
