@@ -1,8 +1,9 @@
 """The magnet pendulum, the coupled pendulums, the gyroscope and the rotor of Finzi, Wang and Wilson (NeurIPS 2020).
 
 Each has the numbers, the starts, the time steps and the lengths of rollouts of their published code, in angles: from
-the x axis and about it for bobs, Euler's z–x–z for bodies. Inertias of the gyroscope and the rotor are second moments
-of their meshes. Of each Lagrangian one number is 1, the scale that no motion shows.
+the x axis and about it for bobs, Euler's z–x–z for the gyroscope; the rotor has a unit quaternion. Inertias of the
+gyroscope and the rotor are second moments of their meshes. Of each Lagrangian one number is 1, the scale that no motion
+shows.
 """
 
 from collections.abc import Callable
@@ -21,7 +22,8 @@ ROTOR = (0.0240936 / 0.1201719, 0.1020485 / 0.1201719)  # J₂/J₁, J₃/J₁
 
 class SpatialScene(NamedTuple):
     """A scene: `known` and the candidate `terms` are functions of (q, v), `true` the numbers of the latter that are not
-    zero, `first` those of them that a fit begins with; `points` are positions (K, 3) of masses at q."""
+    zero, `first` those of them that a fit begins with; `points` are positions (K, 3) of masses at q. `rate` is a
+    reference of another source than the Lagrangian."""
 
     name: str
     theirs: str
@@ -33,6 +35,13 @@ class SpatialScene(NamedTuple):
     first: dict[str, float]
     points: Callable
     starts: Callable
+    constraints: Callable | None = None
+    rate: Callable | None = None
+
+    @property
+    def free(self) -> dict:
+        """Potentials that are learned: none."""
+        return {}
 
     @property
     def law(self) -> lagjax.terms:
@@ -40,7 +49,9 @@ class SpatialScene(NamedTuple):
         return lagjax.terms(self.terms)
 
     def make_rate(self) -> Callable:
-        """A function of states (N, 2n) that returns their rates, by derivatives of the true Lagrangian."""
+        """A function of states (N, 2n) that returns their rates, `rate` or by derivatives of the true Lagrangian."""
+        if self.rate is not None:
+            return self.rate
 
         def lagrangian(q, v):
             return self.known(q, v) + sum(number * self.terms[name](q, v) for name, number in self.true.items())
@@ -144,19 +155,18 @@ def _frame(q):
     return turn(q[0], 0, 1) @ turn(q[1], 1, 2) @ turn(q[2], 0, 1)
 
 
-def _turning_terms(of_angles: Callable) -> dict[str, Callable]:
-    """Products of angular velocities, but the first square, and what gravity does to a body."""
+def _turning_terms(spin: Callable, frame: Callable) -> dict[str, Callable]:
+    """Products of angular velocities, but the first square, and what gravity does to a body, by functions of (q, v) and
+    of q that return the angular velocity and the axes."""
     terms = {}
     for i in range(3):
         for j in range(i, 3):
             if i + j:
                 half = 0.5 if i == j else 1.0
-                terms[f"ω{i + 1} ω{j + 1}"] = lambda q, v, i=i, j=j, half=half: (
-                    half * _spin(*of_angles(q, v))[i] * _spin(*of_angles(q, v))[j]
-                )
+                terms[f"ω{i + 1} ω{j + 1}"] = lambda q, v, i=i, j=j, half=half: half * spin(q, v)[i] * spin(q, v)[j]
     for axis, name in enumerate("xyz"):
         for i in range(3):
-            terms[f"{name} of axis {i + 1}"] = lambda q, v, i=i, axis=axis: _frame(of_angles(q, v)[0])[axis, i]
+            terms[f"{name} of axis {i + 1}"] = lambda q, v, i=i, axis=axis: frame(q)[axis, i]
     return terms
 
 
@@ -175,23 +185,64 @@ def gyroscope() -> SpatialScene:
 
     true = {"ω2 ω2": GYROSCOPE[0], "ω3 ω3": GYROSCOPE[1], "z of axis 3": -GYROSCOPE[2]}
     return SpatialScene(
-        "gyroscope", "1.7e-5", 0.02, 2.0, lambda q, v: 0.5 * _spin(q, v)[0] ** 2, _turning_terms(lambda q, v: (q, v)),
+        "gyroscope", "1.7e-5", 0.02, 2.0, lambda q, v: 0.5 * _spin(q, v)[0] ** 2, _turning_terms(_spin, _frame),
         true, {"ω2 ω2": 1.0, "ω3 ω3": 1.0}, points, starts,
     )  # fmt: skip
 
 
+def _multiply(a, b):
+    """The product (…, 4) of quaternions."""
+    real = a[..., :1] * b[..., :1] - (a[..., 1:] * b[..., 1:]).sum(axis=-1, keepdims=True)
+    xp = np if isinstance(a, np.ndarray) else jnp
+    return xp.concatenate(
+        [real, a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + xp.cross(a[..., 1:], b[..., 1:])], -1
+    )
+
+
+CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def _rotor_rate(y: np.ndarray) -> np.ndarray:
+    """The rates of states (N, 14) of place and quaternion, by Euler's equations: without a Lagrangian."""
+    v, (p, dp), inertia = y[:, 7:], (y[:, 3:7], y[:, 10:]), np.array([1.0, *ROTOR])
+    spin = 2.0 * _multiply(CONJUGATE * p, dp)
+    spin[:, 0] = 0.0
+    pulled = np.zeros_like(spin)
+    pulled[:, 1:] = np.cross(inertia * spin[:, 1:], spin[:, 1:]) / inertia
+    return np.concatenate([v, np.zeros((len(y), 3)), 0.5 * (_multiply(dp, spin) + _multiply(p, pulled))], axis=1)
+
+
 def rotor() -> SpatialScene:
-    """A body without forces."""
-    terms = _turning_terms(lambda q, v: (q[3:], v[3:]))
+    """A body without forces, by place and unit quaternion: a tumbling body passes the poles of Euler's angles."""
+
+    def spin(q, v):
+        return 2.0 * _multiply(CONJUGATE * q[3:], v[3:])[1:]
+
+    def frame(q):
+        turned = [_multiply(_multiply(q[3:], jnp.eye(4)[k]), CONJUGATE * q[3:])[1:] for k in (1, 2, 3)]
+        return jnp.stack(turned, axis=1)
+
+    def starts(count, rng):
+        given = np.clip(2.0 * rng.normal(size=(count, 12)), -3, 3) * np.where(np.arange(12) % 6 < 3, 0.1, 1)
+        (a, b, c), rates = given[:, 3:6].T, given[:, 9:].T
+        zero = np.zeros(count)
+        about = [np.stack([np.cos(x / 2), *(np.sin(x / 2) * np.array(e)[:, None])], axis=1)
+                 for x, e in ((a, (0, 0, 1)), (b, (1, 0, 0)), (c, (0, 0, 1)))]  # fmt: skip
+        p = _multiply(_multiply(about[0], about[1]), about[2])
+        da, db, dc = rates
+        turning = [zero, da * np.sin(b) * np.sin(c) + db * np.cos(c), da * np.sin(b) * np.cos(c) - db * np.sin(c),
+                   da * np.cos(b) + dc]  # fmt: skip
+        return np.concatenate([given[:, :3], p, given[:, 6:9], 0.5 * _multiply(p, np.stack(turning, axis=1))], axis=1)
+
+    terms = _turning_terms(spin, frame)
     for axis, name in enumerate("xyz"):
         terms[name] = lambda q, v, axis=axis: q[axis]
         terms[f"{name}²"] = lambda q, v, axis=axis: q[axis] ** 2
     return SpatialScene(
-        "rotor", "5.8e-6", 0.05, 5.0,
-        lambda q, v: 0.5 * v[:3] @ v[:3] + 0.5 * _spin(q[3:], v[3:])[0] ** 2, terms,
+        "rotor", "5.8e-6", 0.05, 5.0, lambda q, v: 0.5 * v[:3] @ v[:3] + 0.5 * spin(q, v)[0] ** 2, terms,
         {"ω2 ω2": ROTOR[0], "ω3 ω3": ROTOR[1]}, {"ω2 ω2": 1.0, "ω3 ω3": 1.0},
-        lambda q: q[:3] + jnp.concatenate([jnp.zeros((1, 3)), _frame(q[3:]).T]),
-        lambda count, rng: np.clip(2.0 * rng.normal(size=(count, 12)), -3, 3) * np.where(np.arange(12) % 6 < 3, 0.1, 1),
+        lambda q: q[:3] + jnp.concatenate([jnp.zeros((1, 3)), frame(q).T]), starts,
+        lambda q: q[3:] @ q[3:] - 1.0, _rotor_rate,
     )  # fmt: skip
 
 

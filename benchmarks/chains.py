@@ -9,11 +9,13 @@ put back on constraints in addition, which makes a similar spread). Motions are 
 
 L = ½ q̇₀² + Σ params · term: of the kinetic energy and of the potential every number is free but the first, which sets
 the scale that no motion shows. The candidates are products of rates, alone and times the cosine and the sine of
-differences of angles, cosines and sines of angles, of twice these, and of differences between neighbours.
+differences of angles, cosines and sines of angles, of twice these, and of differences between neighbours. With
+`--free` nothing is known of the potential: it is a sum of functions of every angle and of the differences between
+neighbours, each a spline of 32 knots a turn (`lagjax.learned.potential`), and only the kinetic energy has candidates.
 
 Further scenes of theirs are in `_spatial_scenes`: the magnet pendulum, coupled pendulums, the gyroscope, and the rotor.
 
-python -m benchmarks.chains [--links 2 3] [--scenes magnet rotor] [--chunks 800] [--seed 0] [--output FOLDER]
+python -m benchmarks.chains [--links 2 3] [--free] [--scenes magnet rotor] [--chunks 800] [--seed 0] [--output FOLDER]
 """
 
 import argparse
@@ -31,6 +33,7 @@ from benchmarks import _report
 from benchmarks._spatial_scenes import SCENES
 
 CHUNK, ROLLOUTS = 5, 100
+KNOTS = 32
 TOGETHER = 100  # motions in one system of SciPy's
 PUBLISHED = {2: "CLNN 1.1e-4, DeLaN 1.3e-3", 3: "CLNN 3.3e-4, DeLaN 4.1e-2", 5: "CLNN 9.3e-4, DeLaN 0.33"}
 CURVE = {10: "1.3e-2", 100: "6.4e-4", 1000: "9.7e-5", 10000: "2.5e-5"}
@@ -41,12 +44,17 @@ class Chain:
 
     def __init__(self, links: int, rng: np.random.Generator):
         self.links, self.name, self.step, self.long = links, f"chain of {links}", 0.03, 3.0
-        self.theirs = PUBLISHED.get(links, "none")
+        self.theirs, self.constraints = PUBLISHED.get(links, "none"), None
         self.masses, self.lengths = rng.uniform(0.6, 1.4, (2, links))
         below = np.cumsum(self.masses[::-1])[::-1]
         places = np.arange(links)
         self.inertia = np.outer(self.lengths, self.lengths) * below[np.maximum.outer(places, places)]
         self.weight = self.lengths * below
+
+    @property
+    def free(self) -> dict[str, tuple]:
+        """Potentials that are learned: none."""
+        return {}
 
     def make_rate(self):
         """A function of states (N, 2n) that returns their rates."""
@@ -94,6 +102,26 @@ class Chain:
         return lagjax.terms(found)
 
 
+class FreeChain(Chain):
+    """The chain whose potential is learned."""
+
+    def __init__(self, links: int, rng: np.random.Generator):
+        super().__init__(links, rng)
+        self.name += ", V free"
+
+    @property
+    def law(self) -> lagjax.terms:
+        """The terms of the kinetic energy of some chain."""
+        return lagjax.terms({name: term for name, term in super().law.terms.items() if name.startswith(("½", "v"))})
+
+    @property
+    def free(self) -> dict[str, tuple]:
+        """The learned potentials by name, each with the angle that it is a function of."""
+        learned = lagjax.learned.potential((-np.pi, np.pi), count=KNOTS, periodic=True)
+        found = {f"V{i}": (learned, lambda q, i=i: q[i]) for i in range(self.links)}
+        return found | {f"V{i}{i + 1}": (learned, lambda q, i=i: q[i] - q[i + 1]) for i in range(self.links - 1)}
+
+
 def follow(scene, starts: np.ndarray, step: float, long: float) -> np.ndarray:
     """The states (N, T, 2n) of motions at times `step` apart, from SciPy, many of them in one system."""
     rate, ts, found = scene.make_rate(), step * np.arange(round(long / step) + 1), []
@@ -121,9 +149,14 @@ def measure(made, chunks: int, seed: int) -> dict:
     """The fit of one scene, its rollouts, and what both took."""
     rng = np.random.default_rng(seed)
     records, law = make_chunks(made, chunks, rng), made.law
-    scene = lagjax.System(lambda q, v, params: made.known(q, v) + law(q, v, params=params))
+
+    def lagrangian(q, v, params):
+        learned = sum(V(angle(q), params=params[name]) for name, (V, angle) in made.free.items())
+        return made.known(q, v) + law(q, v, params=params["law"]) - learned
+
+    scene = lagjax.System(lagrangian, constraints=made.constraints)
     begun, wall = time.process_time(), time.perf_counter()
-    first = law.params0 | made.first
+    first = {"law": law.params0 | made.first} | {name: V.params0 for name, (V, _) in made.free.items()}
     fit = lagjax.fit(scene, records, first, observe=lambda q, qdot: {"q": q, "v": qdot})
     spent, waited = time.process_time() - begun, time.perf_counter() - wall
     starts = made.starts(ROLLOUTS, rng)
@@ -144,19 +177,21 @@ def measure(made, chunks: int, seed: int) -> dict:
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--links", type=int, nargs="*", default=[2, 3])
+    parser.add_argument("--free", action="store_true", help="the potential of chains is learned, not of known terms")
     parser.add_argument("--scenes", nargs="*", choices=SCENES, default=[])
     parser.add_argument("--chunks", type=int, nargs="+", default=[800])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, help="a folder for the record, chains.json, which is added to")
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
-    makers = [lambda links=links: Chain(links, np.random.default_rng(options.seed)) for links in options.links]
+    kind = FreeChain if options.free else Chain
+    makers = [lambda links=links: kind(links, np.random.default_rng(options.seed)) for links in options.links]
     makers += [SCENES[name] for name in options.scenes]
     found = []
     for make, chunks in itertools.product(makers, options.chunks):
         made = make()
         one = measure(made, chunks, options.seed)
-        if made.name == "chain of 2" and chunks in CURVE:
+        if made.name.startswith("chain of 2") and chunks in CURVE:
             one["theirs"] = CURVE[chunks]
         found.append(one)
         print(

@@ -32,7 +32,7 @@ class Design:
     high: tuple[float, ...]
 
     def about(self, names: tuple[str, ...]) -> "Design":
-        """The same with bounds for each of these names. Raises `ValueError` where there are more bounds or fewer."""
+        """Return the design with bounds for each of these names; raise `ValueError` if their number does not fit."""
         bounds = [x * len(names) if len(x) == 1 else x for x in (self.low, self.high)]
         for which, x in zip(("low", "high"), bounds, strict=True):
             if len(x) != len(names):
@@ -41,11 +41,11 @@ class Design:
         return Design(self.kind, self.count, self.seed, *bounds)
 
     def described(self) -> dict:
-        """The rule without the count."""
+        """Return the rule without the count, for a store's description."""
         return {"rule": self.kind, "seed": self.seed, "low": list(self.low), "high": list(self.high)}
 
     def pieces(self, names: tuple[str, ...]) -> Iterator[np.ndarray]:
-        """The values (m, names) in order, at most `SLICE` at a time; a Latin hypercube is drawn as a whole."""
+        """Yield the values (m, names) in order, at most `SLICE` at a time; a Latin hypercube as a whole."""
         mixed = int.from_bytes(hashlib.sha256("\n".join(names).encode()).digest()[:8], "little")
         key = (mixed << 64) | self.seed  # two axes with one seed are drawn independently
         if self.kind == "random":

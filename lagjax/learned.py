@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -33,9 +34,9 @@ _INNER = np.array([[1.0, -3.0, 3.0, -1.0], [4.0, 0.0, -6.0, 3.0], [1.0, 3.0, 3.0
 
 @dataclass(frozen=True)
 class _SplineAxis:
-    """One argument of a spline: evenly spaced knots from `low` to `high`, of which a periodic one has no last.
+    """One argument of a spline: `count` evenly spaced knots from `low` to `high`; a periodic one has no last knot.
 
-    Of a size, |v|, that begins at `low` no argument lies before the range: its first knot is no border of machine code.
+    `is_size`: the argument is |v| ≥ `low`, so that the first knot is no border of machine code.
     """
 
     low: float
@@ -54,7 +55,7 @@ class _SplineAxis:
 
     @functools.cached_property
     def pieces(self) -> np.ndarray:
-        """The polynomials of pieces (K, 4, 4), as `_INNER`; first that before the range, last that behind it."""
+        """The polynomials of pieces (K, 4, 4), as `_INNER`; the first is before the range, the last behind it."""
         if self.periodic:
             return _INNER[None]
         n = self.count
@@ -68,7 +69,7 @@ class _SplineAxis:
         return found
 
     def locate(self, x) -> tuple:
-        """The polynomials (…, 4, 4) of the piece that x is on, the places (…, 4) of its coefficients, and s."""
+        """Return the polynomials (…, 4, 4) of the piece that contains x, indices (…, 4) of its coefficients, and s."""
         u, four = (x - self.low) / self.step, np.arange(-1, 3)
         table = self.pieces.astype(u.dtype)
         if self.periodic:
@@ -82,7 +83,7 @@ class _SplineAxis:
         return jnp.asarray(table)[piece], place, u - (piece - 1).astype(u.dtype)
 
     def rows(self, x: np.ndarray, order: int = 0) -> np.ndarray:
-        """A derivative of the spline at places x (Q,) inside, as rows (Q, count) for the coefficients."""
+        """Return a derivative of the spline at x (Q,) in the range, as rows (Q, count) for the coefficients."""
         u = (x - self.low) / self.step
         piece = np.clip(np.floor(u).astype(int), 0, self.count - 1 if self.periodic else self.count - 2)
         powers = np.polynomial.polynomial.polyvander(u - piece, 3)
@@ -97,7 +98,7 @@ class _SplineAxis:
         return found
 
     def grams(self) -> list[np.ndarray]:
-        """∫ B⁽ʳ⁾ᵢ B⁽ʳ⁾ⱼ over the range for r = 0, 1, 2, in units in which its length is one."""
+        """Return ∫ B⁽ʳ⁾ᵢ B⁽ʳ⁾ⱼ over the range for r = 0, 1, 2, with the length of the range as unit."""
         length, count = self.high - self.low, self.count if self.periodic else self.count - 1
         nodes, weights = np.polynomial.legendre.leggauss(4)  # exact to degree 7
         x = (self.low + self.step * (np.arange(count)[:, None] + 0.5 * (nodes + 1.0))).ravel()
@@ -145,9 +146,11 @@ class FreeFunction(AbstractLaw):
         if len(arguments) != len(self.axes):
             raise TypeError(f"{self!r} takes {len(self.axes)} argument(s); got {len(arguments)}.")
         kind = jnp.result_type(float, coefficients, *arguments)
-        return self.shape_value(
-            functools.partial(self._spline, coefficients), *(jnp.asarray(x, kind) for x in arguments)
-        )
+        return self._evaluate(coefficients, *(jnp.asarray(x, kind) for x in arguments))
+
+    @functools.partial(jax.jit, static_argnums=0, inline=True)  # outside of `jit` one program
+    def _evaluate(self, coefficients, *x):
+        return self.shape_value(functools.partial(self._spline, coefficients), *x)
 
     def interpolate(self, function: Callable) -> LawParameters:
         """The parameters whose spline takes at its knots the values that `function` of the same arguments gives: where
@@ -184,7 +187,7 @@ class FreeFunction(AbstractLaw):
         return jnp.asarray(params["spline"])
 
     def _spline(self, coefficients, *x):
-        """S at x, each (…): products of pieces that are combined first, since these are constant along a step."""
+        """Return S at x, each (…). Piece polynomials are combined first, since they are constant along a step."""
         x = jnp.broadcast_arrays(*x)
         found = [axis.locate(one) for axis, one in zip(self.axes, x, strict=True)]
         count, batch = len(x), x[0].ndim

@@ -1,9 +1,9 @@
-"""Contacts that are closed at a state, as constraints of the analysis, and whether they stay so.
+"""Contacts that are closed at a state, taken as constraints in the analysis, with a check that they stay closed.
 
     closed: g = 0, force ∇g λ with λ ≥ 0        open: g > 0, λ = 0
 
-A gap that is zero at the state is held. What is found so is true of the scene with contacts where every held gap pushes
-and every other one stays open; else a sentence says which one opens, or closes.
+A gap that is zero at the state becomes a constraint. The result holds for the scene with contacts if every such λ ≥ 0
+and every other gap stays open; else an error names the contact that opens or closes.
 """
 
 from typing import Any, NamedTuple
@@ -17,19 +17,19 @@ from scipy.optimize import nnls
 from lagjax._analysis._scene_state import SceneState
 from lagjax._interface import Layout, accept, is_concrete, restrict_signature
 from lagjax._primitives import nan_unless
-from lagjax._scene import Flat, System, drop_contacts, replace_functions, require_system
+from lagjax._scene import FlatContacts, System, drop_contacts, replace_functions, require_system
 
 # A gap or its rate that is zero, in sizes of its terms: what six digits, or a state in float32, leave of it.
 _CLOSED = 1e-6
 _UNLOADED = 1e-9  # of the largest force: one that is rounding
 
 
-class HeldScene(NamedTuple):
-    """The scene with the gaps at the `places` (c,) among its constraints; and with contacts, as the user gave it."""
+class ClosedScene(NamedTuple):
+    """The scene with the gaps at `places` (c,) as constraints, and the scene with contacts (`given`)."""
 
     system: System
     given: System
-    flat: Flat
+    flat: FlatContacts
     places: tuple[int, ...]
     own: int  # constraints on positions that the scene has besides
 
@@ -42,7 +42,7 @@ class HeldScene(NamedTuple):
         return np.arange(self.own, self.own + len(self.places))
 
     def split(self, multipliers, layout: Layout, params: PyTree) -> tuple:
-        """The multipliers of the constraints and the normal forces of all contacts, in the structures of the user."""
+        """Split multipliers (m,) into those of constraints and the normal forces of contacts, as user's pytrees."""
         end = self.own + len(self.places)
         forces = jnp.zeros(len(self.names), multipliers.dtype)
         forces = forces.at[np.array(self.places, int)].set(multipliers[self.own : end])
@@ -51,7 +51,7 @@ class HeldScene(NamedTuple):
         return of_constraints, self.flat.shapes.name_numbers(forces)
 
     def judge(self, scene: SceneState, q, multipliers, ok) -> tuple:
-        """The multipliers (m,) of an equilibrium at q (n,), whether it is one of the contacts, and why it is none."""
+        """Return the multipliers (m,) of an equilibrium at q (n,), whether contacts allow it, a message if not."""
         pushes, jacobian = multipliers[self._contact_rows], scene.jacobian(q, scene.qdot)
         gaps, slopes = _gaps_and_slopes(self.flat, q, scene.params)
         rounding = _UNLOADED * jnp.max(jnp.abs(multipliers), initial=0.0)
@@ -72,9 +72,9 @@ class HeldScene(NamedTuple):
         return multipliers, fine, self._explain_opening(pushes, "At the equilibrium that was found")
 
     def require_loaded(self, q: PyTree, qdot: PyTree, params: PyTree, why: str) -> PyTree:
-        """q, where all that is held presses; else raise `ValueError`, or, where that is being traced, q as NaN.
+        """Return q if every closed contact presses; else raise `ValueError`, or return NaN if traced.
 
-        The error says which contact does not press, and `why` it has to.
+        The message says which contact does not press, and `why` it has to.
         """
         if not self.places:
             return q
@@ -101,11 +101,11 @@ def one_sided_reason(what: str) -> str:
     return f"{what} next to a contact without load is linear on one side of it alone."
 
 
-def hold_closed(system: Any, q: PyTree, qdot: PyTree, params: PyTree, what: str) -> HeldScene | None:
-    """The scene with the gaps held that are zero at the state; None for one without contacts.
+def constrain_closed(system: Any, q: PyTree, qdot: PyTree, params: PyTree, what: str) -> ClosedScene | None:
+    """Return the scene with the gaps that are zero at the state as constraints; None if it has no contacts.
 
-    Raises `ValueError` where a gap is negative or closes with a velocity, where a closed contact has friction, and
-    where it is not known which are closed.
+    Raises `ValueError` if a gap is negative or closes with a velocity, if a closed contact has friction, and if q is
+    traced, so that it is not known which are closed.
     """
     if not isinstance(system, System) or not system.touches:
         return None
@@ -120,7 +120,7 @@ def hold_closed(system: Any, q: PyTree, qdot: PyTree, params: PyTree, what: str)
     with jax.ensure_compile_time_eval():
         rest = _allowed_velocities(q, qdot)
         layout = Layout.from_state(q, rest)
-        flat = Flat.from_system(system, layout, params)
+        flat = FlatContacts.from_system(system, layout, params)
         at, rate = layout.flatten(q), layout.flatten(rest)
         gaps, slopes = _gaps_and_slopes(flat, at, params)
         rates = slopes @ rate
@@ -142,11 +142,11 @@ def hold_closed(system: Any, q: PyTree, qdot: PyTree, params: PyTree, what: str)
     own = 0 if system.constraints is None else sum(
         leaf.size for leaf in jax.tree.leaves(system._output_shapes("constraints", layout, params))
     )  # fmt: skip
-    return HeldScene(_hold_contacts(system, places), system, flat, places, own)
+    return ClosedScene(_hold_contacts(system, places), system, flat, places, own)
 
 
 def _pressing_shares(jacobian: np.ndarray, force: np.ndarray, rows: np.ndarray) -> np.ndarray | None:
-    """λ (m,) with F + Gᵀλ = 0 that is not negative in these `rows`; None where there is none."""
+    """Return λ (m,) with F + Gᵀλ = 0 that is not negative in these `rows`; None if there is none."""
     both = np.delete(np.arange(len(jacobian)), rows)
     shares, left = nnls(np.concatenate([jacobian[rows], jacobian[both], -jacobian[both]]).T, -force)
     if left > _UNLOADED * np.linalg.norm(force):
@@ -161,18 +161,18 @@ def _allowed_velocities(q: PyTree, qdot: PyTree) -> PyTree:
     return jax.tree.map(lambda x: jnp.zeros_like(jnp.asarray(x, float)), q) if qdot is None else qdot
 
 
-def _gaps_and_slopes(flat: Flat, q, params: PyTree) -> tuple:
-    """All gaps (k,) and their gradients (k, n) at q (n,)."""
+def _gaps_and_slopes(flat: FlatContacts, q, params: PyTree) -> tuple:
+    """Return all gaps (k,) and their gradients (k, n) at q (n,)."""
     time = jnp.zeros((), q.dtype)
     return flat.gaps(q, time, params), jax.jacfwd(flat.gaps)(q, time, params)
 
 
 def _gap_sizes(gaps, slopes, q):
-    """The sizes (k,) of what makes gaps; where q is zero that is what rounding leaves of terms of one."""
+    """Return the magnitudes (k,) of the terms of each gap, for the rounding error of the gap."""
     return abs(slopes) @ abs(q) + 1e-8 * (1.0 + abs(gaps))
 
 
-def _require_no_friction(flat: Flat, places: tuple[int, ...], params: PyTree, what: str) -> None:
+def _require_no_friction(flat: FlatContacts, places: tuple[int, ...], params: PyTree, what: str) -> None:
     rough = [k for k in flat.rough.tolist() if k in places]
     if not rough:
         return
@@ -186,7 +186,7 @@ def _require_no_friction(flat: Flat, places: tuple[int, ...], params: PyTree, wh
 
 
 def _hold_contacts(system: System, places: tuple[int, ...]) -> System:
-    """The scene with these gaps among its constraints, and without contacts."""
+    """Return the scene with these gaps as constraints, and without contacts."""
     bare, own, contacts = drop_contacts(system), system.constraints, system.contacts
     if not places or contacts is None:
         return bare

@@ -103,7 +103,7 @@ def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordin
 
 
 def _new_state(place: Function, q: PyTree, qdot: PyTree, guess: PyTree, t, params: PyTree) -> tuple[PyTree, PyTree]:
-    """(Q, Q̇) with q(Q, t) = q and (∂q/∂Q) Q̇ + ∂q/∂t = q̇."""
+    """Solve q(Q, t) = q and (∂q/∂Q) Q̇ + ∂q/∂t = q̇ for (Q, Q̇), by Newton's method from `guess`."""
     old, new = Layout.from_state(q, qdot), Layout.from_state(guess, guess)
     if old.size != new.size:
         raise ValueError(

@@ -31,7 +31,7 @@ _UNITS = 32
 
 
 def _call_numpy(function: Callable, shapes: tuple, *arrays) -> tuple:
-    """The arrays of shapes `shapes` that a NumPy function returns on the host for `arrays`, with any batch axes."""
+    """Call a NumPy function on the host inside a traced program; return arrays of these `shapes`, with batch axes."""
 
     def fill_buffers(_, places, *buffers):
         for place, value in zip(places, function(*map(np.asarray, buffers)), strict=True):
@@ -47,7 +47,7 @@ def _call_numpy(function: Callable, shapes: tuple, *arrays) -> tuple:
 
 
 def _map_finite(function: Callable, *arrays: np.ndarray) -> list[np.ndarray]:
-    """`function` of every matrix of a batch (…, n, n); NaN where they are not finite or LAPACK gives up."""
+    """Apply `function` to every matrix of a batch (…, n, n); NaN if not finite or LAPACK fails."""
     batch, results = arrays[0].shape[:-2], []
     for members in zip(*(x.reshape(-1, *x.shape[-2:]) for x in arrays), strict=True):
         try:
@@ -67,14 +67,14 @@ def _map_finite(function: Callable, *arrays: np.ndarray) -> list[np.ndarray]:
 
 @jax.custom_jvp
 def symmetric_modes(stiffness: Matrix, mass: Matrix) -> tuple[Float[Array, " n"], Matrix]:
-    """λ (n,), ascending, and X (n, n) with K X = M X Λ, XᵀM X = 1; NaN where M is not positive definite."""
+    """Return λ (n,), ascending, and X (n, n) with K X = M X Λ, XᵀM X = 1; NaN if M is not positive definite."""
     n = len(mass)
     shapes = jax.ShapeDtypeStruct((n,), mass.dtype), jax.ShapeDtypeStruct((n, n), mass.dtype)
     return _call_numpy(lambda *x: _map_finite(_symmetric_modes, *x), shapes, stiffness, mass)  # pyright: ignore[reportReturnType]
 
 
 def _symmetric_modes(stiffness: np.ndarray, mass: np.ndarray) -> list[np.ndarray]:
-    """λ and X of one pair; the last step, a Rayleigh quotient each, makes small eigenvalues as exact as K allows."""
+    """Return λ and X of one pair; a final Rayleigh quotient makes small eigenvalues as exact as K allows."""
     stiffness, mass = 0.5 * (stiffness + stiffness.T), 0.5 * (mass + mass.T)
     lower = np.linalg.inv(np.linalg.cholesky(mass))
     vectors = lower.T @ np.linalg.eigh(lower @ stiffness @ lower.T)[1]
@@ -94,7 +94,7 @@ def _symmetric_modes_jvp(primals, tangents):
 
 
 def _equal_pairs(values) -> Array:
-    """True for each pair of eigenvalues that count as equal, (n, n), each with itself."""
+    """Return (n, n): True where two eigenvalues are equal up to rounding, and on the diagonal."""
     values = jax.lax.stop_gradient(values)
     size = jnp.max(jnp.abs(values))
     allowed = _UNITS * len(values) ** 0.5 * jnp.finfo(size.dtype).eps * size
@@ -102,7 +102,7 @@ def _equal_pairs(values) -> Array:
 
 
 def _inverse_gaps(values) -> Array:
-    """1/(λⱼ − λᵢ), (n, n), and zero where the two meet."""
+    """Return 1/(λⱼ − λᵢ), (n, n), and 0 where the two are equal."""
     same = _equal_pairs(values)
     return jnp.where(same, 0, 1 / jnp.where(same, 1, values - values[:, None]))
 
@@ -111,18 +111,18 @@ def _inverse_gaps(values) -> Array:
 
 
 def exponents_and_modes(matrix: Float[Array, "2n 2n"]) -> tuple[Array, Array]:
-    """Eigenvalues s (2n,) and vectors (2n, 2n), a vector a column, of a real matrix; complex.
+    """Return eigenvalues s (2n,) and eigenvectors (2n, 2n), in columns, of a real matrix; complex.
 
-    The first n are the modes: of a complex pair the one with Im s > 0; real ones go in pairs, the largest with the
-    smallest and so on, of which the larger is among the first. Those are sorted by Im s, growing ones first; the last n
-    are their partners. Derivatives are NaN where there is no basis of eigenvectors.
+    The first n are the modes: of a complex pair the one with Im s > 0; real ones are paired, the largest with the
+    smallest and so on, and the larger is among the first. Those are sorted by Im s, growing ones first; the last n are
+    their partners. Derivatives are NaN where there is no basis of eigenvectors.
     """
     return _decompose(matrix)[:2]
 
 
 @jax.custom_jvp
 def _decompose(matrix: Array) -> tuple[Array, Array, Array]:
-    """s, X and X⁻¹."""
+    """Return s, X and X⁻¹."""
     n, dtype = len(matrix), jnp.result_type(matrix, jnp.complex64)
     shapes = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in ((n,), (n, n), (n, n)))
     return _call_numpy(lambda a: _map_finite(_general, a), shapes, matrix)  # pyright: ignore[reportReturnType]
@@ -142,7 +142,7 @@ def _general(matrix: np.ndarray) -> list[np.ndarray]:
 
 
 def _eigenvalue_order(values: np.ndarray) -> np.ndarray:
-    """The indices (n,) that sort eigenvalues (n,) into the order of `exponents_and_modes`."""
+    """Return the indices (n,) that sort eigenvalues (n,) into the order of `exponents_and_modes`."""
     reals, imaginary = np.real(values), np.imag(values)
     real = np.flatnonzero(imaginary == 0)
     real = real[np.argsort(-reals[real], kind="stable")]
@@ -165,7 +165,7 @@ def _decompose_jvp(primals, tangents):
 
 
 def _null_space(rows: Float[Array, "m n"], rank: int) -> Float[Array, "n n-rank"]:
-    """An orthonormal basis, a vector a column, of what m rows of this rank send to zero; without derivatives."""
+    """Return an orthonormal basis, in columns, of the null space of m rows of this rank; without derivatives."""
     n = rows.shape[1]
     lengths = jnp.linalg.norm(rows, axis=1, keepdims=True)
     unit = jax.lax.stop_gradient(rows / jnp.where(lengths > 0, lengths, 1))
@@ -174,7 +174,7 @@ def _null_space(rows: Float[Array, "m n"], rank: int) -> Float[Array, "n n-rank"
 
 
 def tangent_basis(jacobian: Float[Array, "m n"], rank: int) -> Float[Array, "n n-rank"]:
-    """A basis of the deviations that constraints allow; it moves with the point as little as it can."""
+    """Return a basis of the deviations that constraints allow, in columns, with a minimal derivative by q."""
     if not len(jacobian):
         return jnp.eye(jacobian.shape[1], dtype=jacobian.dtype)
     basis = _null_space(jacobian, rank)

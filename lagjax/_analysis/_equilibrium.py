@@ -1,4 +1,4 @@
-"""`equilibrium`: where a scene stays, at rest or in steady motion."""
+"""`equilibrium`: the equilibria of a scene, at rest or in steady motion."""
 
 from typing import Any, NamedTuple
 
@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 from scipy.sparse import diags_array
 
-from lagjax._analysis._closed_contacts import hold_closed
+from lagjax._analysis._closed_contacts import constrain_closed
 from lagjax._analysis._lowest_modes import Sparse
 from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._solve import is_root, levenberg_marquardt, newton, shortest_preimage
@@ -115,7 +115,7 @@ def equilibrium(
     """
     require_flag(throw, "throw")
     require_flag(stable, "stable")
-    held = hold_closed(system, q, qdot, params, "An equilibrium")
+    held = constrain_closed(system, q, qdot, params, "An equilibrium")
     if held is not None and stable:
         raise ValueError(
             "stable=True is for scenes without contacts: simulate this one with a dissipation until it rests, and give "
@@ -147,7 +147,7 @@ def equilibrium(
 
 
 def find_balance(scene: SceneState, steady: "Steady | None") -> tuple[Vector, Vector, Array, Bool[Array, ""]]:
-    """q and q̇ (n,), λ (m,) and whether they are an equilibrium, or a `steady` motion."""
+    """Solve for an equilibrium, or for a `steady` motion: q and q̇ (n,), λ (m,), and whether one was found."""
     found = _solve_balance(False, steady, *scene.arguments)
     if scene.concrete and not found[-1]:  # with the rounding of terms, whose program is compiled where it may matter
         found = _solve_balance(True, steady, *scene.arguments)
@@ -155,7 +155,7 @@ def find_balance(scene: SceneState, steady: "Steady | None") -> tuple[Vector, Ve
 
 
 def _settled_scene(scene: SceneState, qdot: PyTree) -> SceneState:
-    """The scene at the state where friction brings it to rest. Raises `ValueError` where no motion can be followed."""
+    """Return the scene at the state where friction brings it to rest; raise `ValueError` if that fails."""
     if qdot is not None:
         raise ValueError("stable=True finds where a scene comes to rest: leave qdot out, or look at normal_modes.")
     if not scene.concrete:
@@ -167,7 +167,7 @@ def _settled_scene(scene: SceneState, qdot: PyTree) -> SceneState:
 
 
 def require_steady(scene: SceneState) -> None:
-    """Raise `ValueError` where a coordinate that something depends on has a velocity."""
+    """Raise `ValueError` if a coordinate that is not cyclic has a velocity."""
     if not scene.concrete or scene.lowered is None:
         return
     cyclic = scene.conserved
@@ -193,7 +193,7 @@ _RTOL = 1e-6
 
 
 def _settled_position(scene: SceneState) -> PyTree:
-    """q where the scene comes to rest with friction, in the user's pytree. Raises `ValueError` where it does not."""
+    """Simulate with friction until the scene is at rest; return q as a pytree, or raise `ValueError`."""
     scales, layout = scene.scales, scene.layout
     # Links between neighbours are short beside a large scene.
     off = _ASIDE / layout.size if scene.large and scene.constrained else _ASIDE
@@ -225,7 +225,7 @@ def _settled_position(scene: SceneState) -> PyTree:
 
 
 def _add_friction(system: System) -> System:
-    """The scene at t = 0 with ½ c q̇ᵀM q̇ added to its dissipation; `params` are {"of": its own, "rate": c}."""
+    """Return the scene at t = 0 with ½ c q̇ᵀM q̇ added to its dissipation; `params` are {"of": its own, "rate": c}."""
 
     def dissipation(q, qdot, params):
         def scale_velocity(s):
@@ -252,8 +252,10 @@ _TINY = 1e-6  # of the other multipliers: one that counts as their rounding
 
 
 class Steady(NamedTuple):
-    """A motion that is sought: the `cyclic` coordinates (n,), of which velocities are unknown and not the place; the
-    unknowns (n,) that are `held`; `moves` (n, n) and `turns` (n, n, n) are those of `SteadySymmetries`."""
+    """A steady motion to find: `cyclic` coordinates (n,) have unknown velocities, others unknown positions.
+
+    Unknowns that are `held` (n,) are given. `moves` (n, n), `turns` (n, n, n) are those of `SteadySymmetries`.
+    """
 
     cyclic: Bool[Array, " n"]
     held: Bool[Array, " n"]
@@ -261,15 +263,17 @@ class Steady(NamedTuple):
     turns: Float[Array, "n n n"]
 
     def state(self, scene: SceneState, x: Vector) -> tuple[Vector, Vector]:
-        """(q, q̇) by the unknowns (n,)."""
+        """Return (q, q̇) from the unknowns (n,)."""
         x = jnp.where(self.held, jnp.where(self.cyclic, scene.qdot, scene.q), x)
         return jnp.where(self.cyclic, scene.q, x), self.moves @ jnp.where(self.cyclic, x, 0)
 
 
 @compile_for_one_call
 def _solve_balance(has_terms: bool, steady: Steady | None, *arguments) -> tuple[Vector, Vector, Array, Array]:
-    """q and q̇ (n,), λ (m,) and whether they are an equilibrium, or a `steady` motion; near q = 0 that is for the
-    rounding of terms to decide."""
+    """Return q and q̇ (n,), λ (m,) and whether they are an equilibrium, or a `steady` motion.
+
+    `has_terms`: near q = 0 the rounding of the terms of the forces decides that.
+    """
     scene = SceneState.from_arguments(*arguments)
     n = scene.layout.size
 
@@ -277,7 +281,7 @@ def _solve_balance(has_terms: bool, steady: Steady | None, *arguments) -> tuple[
         return (x, scene.qdot) if steady is None else steady.state(scene, x)
 
     def force_at(q: Vector, qdot: Vector) -> Vector:
-        """F − M q̈ (n,), with the q̈ = Σ q̇ᵢ Ωᵢ q̇ of a steady motion; F alone at rest."""
+        """Return F − M q̈ (n,), with the q̈ = Σ q̇ᵢ Ωᵢ q̇ of a steady motion; F alone at rest."""
         force = scene.force(q, qdot)
         if steady is None:
             return force
@@ -312,8 +316,10 @@ def _solve_balance(has_terms: bool, steady: Steady | None, *arguments) -> tuple[
 
 
 def _number_units(mass: Float[Array, "n n"], jacobian: Float[Array, "n+m n+m"], places: Any) -> Unknowns:
-    """A unit of each number of z, alike in all units of a user: 1/√Mᵢᵢ for qᵢ, which are `places`, for velocities and λ
-    what makes as much of forces."""
+    """Return a unit for each unknown, so that results do not depend on the user's units.
+
+    It is 1/√Mᵢᵢ for qᵢ (`places`); velocities and λ have the unit in which they change forces as much.
+    """
     inertia, n = jnp.abs(jnp.diagonal(mass)), len(mass)
     root = jnp.sqrt(jnp.where((inertia > 0) & jnp.isfinite(inertia), inertia, 1))
     scaled = jax.lax.stop_gradient(jacobian)[:n] / root[:, None]
@@ -325,14 +331,14 @@ def _number_units(mass: Float[Array, "n n"], jacobian: Float[Array, "n+m n+m"], 
 
 
 def balance(scene: SceneState, q: Vector, qdot: Vector, force: Vector, multipliers: Array) -> Unknowns:
-    """F + Gᵀλ (n,) of a `force` F, then the constraints on positions and on velocities (m,): zero in equilibrium."""
+    """Return F + Gᵀλ (n,), then the constraints on positions and velocities (m,): all zero in equilibrium."""
     jacobian = scene.jacobian(q, qdot)
     rows = scene.motion.constraints.residual(q, qdot, jnp.zeros((), q.dtype), scene.numbers)
     return jnp.concatenate([force + jacobian.T @ multipliers, rows])
 
 
 def least_multipliers(jacobian: Float[Array, "m n"], force: Vector) -> Array:
-    """λ (m,) that leave the smallest force F + Gᵀλ; of least norm where constraints are redundant."""
+    """Return the λ (m,) of least norm that minimises |F + Gᵀλ|."""
     return -least_norm(jacobian @ jacobian.T, jacobian @ force) if len(jacobian) else jnp.zeros(0, force.dtype)
 
 
@@ -340,7 +346,7 @@ def least_multipliers(jacobian: Float[Array, "m n"], force: Vector) -> Array:
 
 
 def _solve_large_balance(scene: SceneState, qdot: PyTree, stable: bool) -> tuple[Vector, Array, Bool[Array, ""], str]:
-    """q (n,), λ (m,), whether they are an equilibrium, and why not."""
+    """Return q (n,), λ (m,), whether they are an equilibrium, and a message if not."""
     n, state = scene.layout.size, (scene.q, scene.qdot, jnp.zeros((), scene.q.dtype), scene.numbers)
     if qdot is not None:
         raise ValueError(f"Steady motions of {n} coordinates are not sought: leave qdot out, or give fewer of them.")
@@ -365,7 +371,7 @@ def _solve_large_balance(scene: SceneState, qdot: PyTree, stable: bool) -> tuple
 
 
 def _explain_no_equilibrium(scene: SceneState, gradient: Sparse | None = None) -> str:
-    """The reason why no equilibrium is found; a large scene has the sparse `gradient` of forces at the guess."""
+    """Return a message on why there is no equilibrium; `gradient`: the sparse force gradient of a large scene."""
     force, names = np.asarray(scene.force(scene.q, scene.qdot)), scene.layout.names
     if gradient is None:
         slopes = np.abs(jax.jacfwd(scene.force)(scene.q, scene.qdot)).sum(axis=1)

@@ -1,8 +1,8 @@
-"""The gauge G(q, t) of a symmetry, from the change of L that is its time derivative.
+"""The gauge G(q, t) of a symmetry: the function whose time derivative is the change Λ of L.
 
 Λ = ∂G/∂q·q̇ + ∂G/∂t is affine in q̇, so that ∂G/∂q = ∂Λ/∂q̇ and ∂G/∂t = Λ(q, 0, t). G is their integral along the
-straight line from a state of reference, where it is zero; where ∂G/∂q is constant, G = ∂G/∂q·q. What the rule of
-integration misses, `is_right` finds.
+straight line from a reference state, where it is zero; if ∂G/∂q is constant, G = ∂G/∂q·q. `is_right` verifies the
+numerical integral.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ _ZERO, _RIGHT = 1e-10, 1e-9
 
 
 class Changes(NamedTuple):
-    """The change of L under D transformations at S states: Λ (S, D), ∂Λ/∂q̇ (S, D, n), Λ at rest, the size of its terms.
+    """Changes of L by D transformations at S states: Λ (S, D), ∂Λ/∂q̇ (S, D, n), Λ at rest, the size of its terms.
 
     ∂Λ/∂q̇ is by velocities in units of their sizes, so that it compares with Λ. `gradients` (S, D, 2n) are those of the
     charges p·ξ − h τ − G by q and q̇.
@@ -39,7 +39,7 @@ class Changes(NamedTuple):
 
 
 def changes_of(scene: SceneState, fields: Fields, weights: np.ndarray, states: FlatState) -> tuple[Changes, FlatState]:
-    """The changes of L by transformations with weights (D, K), at states where they are finite, and these states."""
+    """Return the changes of L by transformations with weights (D, K), and the states at which they are finite."""
     parts = [np.asarray(x) for x in _changes_at_states(jnp.asarray(weights), fields, states, *scene.arguments)]
     well = np.logical_and.reduce([np.isfinite(x).all(axis=tuple(range(1, x.ndim))) for x in parts])
     if not well.any():
@@ -51,7 +51,7 @@ def changes_of(scene: SceneState, fields: Fields, weights: np.ndarray, states: F
 
 
 def gauge_of(scene: SceneState, fields: Fields, weights: np.ndarray, k: int, changes: Changes) -> Callable | None:
-    """G(q, t=0.0, params=None) of the symmetry with these weights (K,), number k; None where L does not change."""
+    """Return G(q, t=0.0, params=None) of symmetry k with these weights (K,); None if L does not change."""
     values, slopes, at_rest, sizes = (x[:, k] for x in changes[:4])
     size = sizes.max()
     if np.abs(values).max() <= _ZERO * size:
@@ -110,7 +110,7 @@ def _changes_at_states(weights: Array, fields: Fields, states: FlatState, *argum
 
 
 def _change_at_state(scene: SceneState, fields: Fields, transform: Callable, state: FlatState) -> tuple:
-    """The fields of `Changes` of one transformation at one state."""
+    """Return the fields of `Changes` of one transformation at one state."""
     q, qdot, t = state.q, state.qdot, state.t
 
     def change(qdot):

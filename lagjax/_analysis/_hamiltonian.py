@@ -104,7 +104,7 @@ def hamiltonian(system: System) -> Hamiltonian:
 
 
 def _hamiltonian_equations(system: System, q: PyTree, p: PyTree, t, params: PyTree) -> tuple[PyTree, PyTree, Array]:
-    """q̇ and ṗ, in the structure of q, and H."""
+    """Return q̇ and ṗ, in the structure of q, and H."""
     system, layout = present_system(system), Layout.from_state(q, p)
     flat = layout.flatten(q), layout.flatten(p), as_arrays(params, layout.dtype)
     v, force, energy = _flat_hamiltonian_equations(jnp.asarray(t, layout.dtype), system, layout, *flat)
@@ -113,7 +113,7 @@ def _hamiltonian_equations(system: System, q: PyTree, p: PyTree, t, params: PyTr
 
 @compile_for_one_call
 def _flat_hamiltonian_equations(t, *arguments) -> tuple[Vector, Vector, Array]:
-    """q̇ = v with ∂L/∂q̇(q, v, t) = p, by Newton's method from rest, ṗ and H; p is in the place of q̇."""
+    """Return q̇ from ∂L/∂q̇(q, q̇, t) = p, by Newton's method from rest, ṗ and H; the argument q̇ is p."""
     scene = SceneState.from_arguments(*arguments)
     motion, q, p = scene.motion, scene.q, scene.qdot
 
@@ -134,7 +134,7 @@ def _flat_hamiltonian_equations(t, *arguments) -> tuple[Vector, Vector, Array]:
 
 
 def _sparse_newton(motion: SparseMotion, q: Vector, t, numbers: PyTree) -> tuple[Callable, Callable]:
-    """Functions that find a root of p(q, v) by v, and solve with its derivative M, by pattern: for `custom_root`."""
+    """Return functions for `custom_root`: one solves ∂L/∂q̇(q, v) = p for v, one solves with its sparse Jacobian M."""
 
     def solve(multiply, right):
         mass = motion.structure.mass.prepare(multiply, q.dtype)

@@ -1,8 +1,8 @@
-"""`inverse_dynamics`: the forces that an acceleration takes."""
+"""`inverse_dynamics`: the forces that produce a given acceleration."""
 
 from jaxtyping import PyTree
 
-from lagjax._analysis._closed_contacts import hold_closed
+from lagjax._analysis._closed_contacts import constrain_closed
 from lagjax._interface import Layout, is_concrete
 from lagjax._scene import System, Time, describe_violation, require_system
 
@@ -54,7 +54,7 @@ def inverse_dynamics(
     if isinstance(system, System) and system.contacts is not None and "t" in system.contacts.extras:
         raise ValueError("Inverse dynamics is for contacts that do not depend on the time: which are closed at t?")
     closed: dict[int, str] = {}  # contacts by their places among the constraints
-    if held := hold_closed(system, q, qdot, params, "Inverse dynamics"):
+    if held := constrain_closed(system, q, qdot, params, "Inverse dynamics"):
         alone = "Which part of the forces it takes is not known: build the System without this contact, or move q."
         system, q = held.system, held.require_loaded(q, qdot, params, alone)
         closed = {held.own + k: held.names[place] for k, place in enumerate(held.places)}

@@ -1,4 +1,4 @@
-"""`linearize`: the motions next to a motion."""
+"""`linearize`: the linear equations of small deviations from a motion."""
 
 import re
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from lagjax._analysis._closed_contacts import HeldScene, hold_closed, one_sided_reason
+from lagjax._analysis._closed_contacts import ClosedScene, constrain_closed, one_sided_reason
 from lagjax._analysis._eigen import tangent_basis
 from lagjax._analysis._equilibrium import least_multipliers
 from lagjax._analysis._scene_state import SceneState, require_matrices
@@ -29,7 +29,15 @@ from lagjax._interface import (
 )
 from lagjax._primitives import accepts_singles, nan_unless
 from lagjax._run import simulate
-from lagjax._scene import Driven, System, asking_for_inputs, drive_scene, held_inputs, push_by_inputs, require_system
+from lagjax._scene import (
+    DrivenParams,
+    System,
+    add_input_forces,
+    constant_inputs,
+    drive_scene,
+    require_system,
+    roles_with_inputs,
+)
 
 Vector = Float[Array, " n"]
 Matrix = Float[Array, "n n"]
@@ -38,7 +46,7 @@ _SHOWN = 8  # equations that are printed
 
 @jax.tree_util.register_static
 class LinearNames(tuple):
-    """The names of the coordinates (n,); `states` (2n,), `inputs` (m,) and `outputs` (p,) are those of the others."""
+    """The names of the coordinates (n,), with those of `states` (2n,), `inputs` (m,) and `outputs` (p,)."""
 
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
@@ -162,8 +170,7 @@ class ReducedLinearization(NamedTuple):
 
 @compile_for_one_call
 def _co_rotating_frame(a: Array, rows: Array, qdot: Vector, moves: Array, turns: Array) -> tuple[Array, Array]:
-    """A in a frame that turns with a steady motion, and rows (k + n, 2n) whose last ones, one for each coordinate that
-    is cyclic, are zero for what is orthogonal to a deviation along it."""
+    """Return A in the frame that rotates with a steady motion, and rows (k + n, 2n) that exclude cyclic coordinates."""
     spin = jnp.einsum("i,ijk", qdot, turns.astype(a.dtype))
     moved = jnp.hstack([moves.T.astype(a.dtype), turns.astype(a.dtype) @ qdot])
     return a - jnp.kron(jnp.eye(2, dtype=a.dtype), spin), jnp.concatenate([rows, moved])
@@ -179,9 +186,9 @@ def _reduced_fields(rank: int, rows: Array, a: Array, b: Array, c: Array, d: Arr
 
 
 def _equation_lines(left: list[str], rows: np.ndarray, of: list[str]) -> list[str]:
-    """Lines such as "δq'' = -1 δq +1 u", of each of the rows (k, l) of factors, and how many more there are.
+    """Return lines such as "δq'' = -1 δq +1 u" for the rows (k, l) of factors; the last says how many are left out.
 
-    Rounding is left out: what is a few units in the last place of the largest factor of its row and its column.
+    Factors of a few round-offs of the largest in their row and column are omitted.
     """
     rows, more = np.asarray(rows)[:_SHOWN], len(left) - _SHOWN
     sizes = np.abs(rows)
@@ -249,8 +256,8 @@ def linearize(
     sensor = None if outputs is None else accept(outputs, "outputs", extras=("t", "params", "inputs"))
     if inputs is not None:
         inputs = _require_inputs(system, sensor, inputs)
-        system, params = drive_scene(system, held_inputs), Driven(params, inputs)
-    if held := hold_closed(system, q, qdot, params, "A linearization"):
+        system, params = drive_scene(system, constant_inputs), DrivenParams(params, inputs)
+    if held := constrain_closed(system, q, qdot, params, "A linearization"):
         system, q = held.system, held.require_loaded(q, qdot, params, one_sided_reason("A motion"))
     scene = SceneState.from_state(system, q, qdot, params)
     scene.require_autonomous("A linearization")
@@ -265,12 +272,12 @@ def linearize(
 
 
 def _require_inputs(system: System, sensor: Function | None, inputs: PyTree) -> PyTree:
-    """The inputs, of floats. Raises where no function asks for them, or a constraint does."""
+    """Return the inputs as floats; raise if no function takes them, or a constraint does."""
     integers = lambda x: eqx.is_array_like(x) and jnp.issubdtype(jnp.result_type(x), jnp.integer)  # noqa: E731
     inputs = jax.tree.map(lambda x: 1.0 * x if integers(x) else x, inputs)
     Layout.from_numbers(inputs, "inputs", float)
     require_finite(inputs, "inputs")
-    asking = asking_for_inputs(system)
+    asking = roles_with_inputs(system)
     if not asking and (sensor is None or "inputs" not in sensor.extras):
         raise ValueError(
             "inputs are given, and no function of the scene asks for `inputs`: let forces (or L) do, as "
@@ -285,7 +292,7 @@ def _require_inputs(system: System, sensor: Function | None, inputs: PyTree) -> 
 
 
 def _output_names(sensor: Function, scene: SceneState, driven: bool) -> tuple[str, ...]:
-    """The names of the outputs (p,). Raises `TypeError` where they are no real floats."""
+    """Return the names of the outputs (p,); raise `TypeError` if they are no real floats."""
     shapes = jax.eval_shape(lambda q, v: _outputs(sensor, scene, driven, q, v, scene.params), scene.q, scene.qdot)
     if not (names := Layout.from_numbers(shapes, "outputs", scene.layout.dtype).names):
         raise TypeError("outputs must return at least one number.")
@@ -293,13 +300,13 @@ def _output_names(sensor: Function, scene: SceneState, driven: bool) -> tuple[st
 
 
 def _outputs(sensor: Function, scene: SceneState, driven: bool, q: Vector, qdot: Vector, params: PyTree) -> PyTree:
-    """The outputs in the user's structure, at parameters that are `Driven` where there are inputs."""
+    """Return the outputs in the user's structure; with inputs, `params` are `DrivenParams`."""
     restore, extras = scene.layout.restore, {"inputs": params.inputs} if driven else {}
     return sensor(restore(q), restore(qdot), t=0.0, params=params.params if driven else params, **extras)
 
 
 def _output_matrices(of_inputs: Layout | None, sensor: Function | None, scene: SceneState, u: Vector) -> list[Array]:
-    """C (p, 2n) and D (p, m), of the whole state without a sensor."""
+    """Return C (p, 2n) and D (p, m); without a sensor, of the whole state."""
     if sensor is None:
         return [jnp.eye(2 * scene.q.size, dtype=u.dtype), jnp.zeros((2 * scene.q.size, u.size), u.dtype)]
 
@@ -335,7 +342,7 @@ def _linearize(of_inputs: Layout | None, sensor: Function | None, *arguments) ->
             return inverse.solve_columns(b)
 
     def balance(q, qdot, u):
-        """F + Gᵀλ − M q̈ and γ − G q̈ at fixed q̈ and λ; the constraints and their rates."""
+        """Return F + Gᵀλ − M q̈ and γ − G q̈ at fixed q̈ and λ; the constraints and their rates."""
         place = q, qdot, state[2], eqx.filter(_driven_params(of_inputs, scene, u), eqx.is_array_like)
         jacobian, gamma = constraints.jacobian(*place), constraints.gamma(*place)
         allowed = jnp.concatenate([constraints.f(q, *place[2:]), constraints.rates(*place)])
@@ -353,8 +360,8 @@ def _linearize(of_inputs: Layout | None, sensor: Function | None, *arguments) ->
     return matrices, (*_output_matrices(of_inputs, sensor, scene, u), jnp.hstack(allowed[:2]))
 
 
-def _sample(scene: SceneState, held: HeldScene | None, of_inputs: Layout | None, dt) -> tuple[Array, Array]:
-    """Φ (2n, 2n) and Γ (2n, m). Raises `ValueError` where the motion cannot be followed over dt.
+def _sample(scene: SceneState, held: ClosedScene | None, of_inputs: Layout | None, dt) -> tuple[Array, Array]:
+    """Return Φ (2n, 2n) and Γ (2n, m); raise `ValueError` if the motion over dt fails.
 
     Contacts that are open at the state may close within dt: the motion is that with them.
     """
@@ -365,8 +372,8 @@ def _sample(scene: SceneState, held: HeldScene | None, of_inputs: Layout | None,
     system, params = given if held is None or not held.places else scene.system, scene.params
     if of_inputs is None:  # u are generalised forces
         none = scene.layout.restore(jnp.zeros_like(scene.q))
-        given, system = (drive_scene(push_by_inputs(x), held_inputs) for x in (given, system))
-        params, of_inputs = Driven(params, none), scene.layout
+        given, system = (drive_scene(add_input_forces(x), constant_inputs) for x in (given, system))
+        params, of_inputs = DrivenParams(params, none), scene.layout
     state = scene.layout, scene.q, scene.qdot, params
     phi, gamma = _flow_derivatives(of_inputs, dt, system, *state)
     if held is not None and held.places:
@@ -380,7 +387,7 @@ def _sample(scene: SceneState, held: HeldScene | None, of_inputs: Layout | None,
 
 
 def _require_same_end(dt, given: System, system: System, state: tuple, sampled: tuple) -> tuple:
-    """`sampled` of a scene whose closed contacts are held. Raises `ValueError` where one opens, or another closes."""
+    """Return `sampled`; raise `ValueError` if a contact that is taken as closed opens within dt, or another closes."""
     same = _compare_ends(dt, given, system, *state)
     if not is_concrete(same):
         return tuple(nan_unless(same, x) for x in sampled)
@@ -393,8 +400,8 @@ def _require_same_end(dt, given: System, system: System, state: tuple, sampled: 
 
 
 @eqx.filter_jit
-def _compare_ends(dt, given: System, system: System, layout: Layout, q, qdot, params: Driven) -> Array:
-    """True if the motion over dt of a scene with its contacts ends where that with its closed contacts held does."""
+def _compare_ends(dt, given: System, system: System, layout: Layout, q, qdot, params: DrivenParams) -> Array:
+    """True if the motion over dt with contacts ends in the same state as with the closed ones as constraints."""
     ts = jnp.stack([jnp.zeros((), q.dtype), jnp.asarray(dt, q.dtype)])
     start = layout.restore(q), layout.restore(qdot)
     ends = [simulate(of, *start, ts, params, rtol=_RTOL, throw=False).end for of in (given, system)]
@@ -406,8 +413,8 @@ def _compare_ends(dt, given: System, system: System, layout: Layout, q, qdot, pa
 
 
 @eqx.filter_jit
-def _flow_derivatives(of_inputs: Layout, dt, system: System, layout: Layout, q, qdot, params: Driven):
-    """The derivatives of the state (2n,) after dt by that before it, and by inputs that are held."""
+def _flow_derivatives(of_inputs: Layout, dt, system: System, layout: Layout, q, qdot, params: DrivenParams):
+    """Return the derivatives of the state (2n,) after dt by the one before, and by constant inputs."""
 
     def follow(q, qdot, u):
         driven = params._replace(inputs=of_inputs.restore(u))
@@ -424,7 +431,7 @@ _RTOL = 1e-12  # of a step: what the order of Taylor series makes cheap, and rou
 
 
 def steady_matrices(scene: SceneState, q: Vector) -> tuple[Matrix, Matrix, Matrix, Array, Vector]:
-    """M, C + G, K and J at an equilibrium, where q̈ is zero whatever M is, and what is left of the forces there (n,)."""
+    """Return M, C + G, K and J at an equilibrium, where q̈ is zero whatever M is, and the residual force (n,)."""
     jacobian, force = scene.jacobian(q, scene.qdot), scene.force(q, scene.qdot)
     multipliers = least_multipliers(jacobian, force)
 

@@ -32,7 +32,7 @@ _OFF = 1e-6  # of its length that a shape may be off: the error of its eigenvalu
 
 
 def needs_all(count: int | None, freedoms: int) -> bool:
-    """True if all modes are to be found where `count` are asked for: Lanczos's method takes twice as many vectors."""
+    """True if `count` is so large a part of all modes that computing all of them is cheaper."""
     return count is None or count > freedoms // 4
 
 
@@ -45,9 +45,11 @@ NO_MODES = (
 def lowest_modes(
     stiffness: Sparse, mass: Sparse, jacobian: Sparse, count: int | None
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "n k"]]:
-    """λ (k,), ascending, and X (n, k), a vector a column, of at least `count` of the lowest modes, XᵀM X = 1. The
-    diagonals of K and M are of order one. Raises `ValueError` where M is not positive definite, or constraints depend
-    on each other."""
+    """Return λ (k,), ascending, and X (n, k), in columns, of at least `count` of the lowest modes, XᵀM X = 1.
+
+    K and M have diagonals of order one. Raises `ValueError` if M is not positive definite, or constraints are
+    dependent.
+    """
     if factorize_positive(mass) is None:
         raise ValueError(NO_MODES)
     n, rows = mass.shape[0], jacobian.shape[0]
@@ -88,12 +90,12 @@ def lowest_modes(
 
 
 def _solve_shifted(factors: SuperLU, b: np.ndarray) -> np.ndarray:
-    """The solution x (n,) of (K − σM) x = b, by factors that may be bordered by constraints."""
+    """Solve (K − σM) x = b for x (n,), by factors of a matrix that may be bordered by constraints."""
     return factors.solve(np.append(b, np.zeros(factors.shape[0] - len(b))))[: len(b)]
 
 
 def _modes_of(stiffness: Sparse, mass: Sparse, against: np.ndarray, shift: float, factors, modes: int, which: str):
-    """λ and X of modes next to the shift, with `which` "SA" below it, orthogonal to the vectors `against` (n, j)."""
+    """Return λ and X of modes next to the shift (with `which` "SA" below it), orthogonal to `against` (n, j)."""
     n, weighted = len(against), mass @ against
 
     def project_inverse(b):
@@ -128,7 +130,7 @@ def _slice_spectrum(
 
 
 def _factor_symmetric(matrix: Sparse) -> SuperLU | None:
-    """The factors of a symmetric matrix without pivoting; None where that meets a zero."""
+    """Factor a symmetric matrix without pivoting; None if a pivot is zero."""
     options = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
     try:
         factors = splu(csc_array(matrix), **options)
@@ -138,7 +140,7 @@ def _factor_symmetric(matrix: Sparse) -> SuperLU | None:
 
 
 def _rayleigh_ritz(stiffness: Sparse, mass: Sparse, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """λ (k,) and X (n, k) of the modes within the span of a basis (n, k)."""
+    """Return λ (k,) and X (n, k) of the modes within the span of a basis (n, k)."""
     values, shapes = symmetric_modes(basis.T @ (stiffness @ basis), basis.T @ (mass @ basis))
     return np.asarray(values), basis @ np.asarray(shapes)
 
@@ -170,13 +172,13 @@ def lowest_shift(stiffness: Sparse, mass: Sparse, jacobian: Sparse = None) -> tu
 
 
 def factorize_positive(matrix: Sparse) -> SuperLU | None:
-    """The factors of a positive definite matrix, by elimination without pivoting; None where it is none."""
+    """Factor a matrix by elimination without pivoting; None if it is not positive definite."""
     factors = _factor_symmetric(matrix)
     return factors if factors is not None and (factors.U.diagonal() > 0).all() else None
 
 
 def factorize_regular(matrix: Sparse) -> SuperLU | None:
-    """The factors of a matrix, by elimination with pivoting; None where it is singular to working precision."""
+    """Factor a matrix by elimination with pivoting; None if it is singular to working precision."""
     try:
         factors = splu(csc_array(matrix))
     except RuntimeError:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, PyTree
 from scipy.sparse import csr_array, diags_array
 
-from lagjax._analysis._closed_contacts import hold_closed, one_sided_reason
+from lagjax._analysis._closed_contacts import constrain_closed, one_sided_reason
 from lagjax._analysis._eigen import exponents_and_modes, symmetric_modes, tangent_basis
 from lagjax._analysis._equilibrium import require_steady
 from lagjax._analysis._linearize import steady_matrices
@@ -84,7 +84,7 @@ def _mode_kind(pair: np.ndarray, size: float) -> str:
 
 
 def _growth_threshold(size):
-    """The real part that counts as growth: rounding splits a double zero by √eps of the largest exponent, or more."""
+    """Return the real part that counts as growth: rounding splits a double zero by √eps of the largest exponent."""
     return 7 * float(np.finfo(size.dtype).eps) ** 0.5 * size
 
 
@@ -130,7 +130,7 @@ def normal_modes(
     """
     if count is not None and (type(count) is not int or count < 1):
         raise ValueError(f"count must be a positive integer, or None for all modes; got {count!r}.")
-    if held := hold_closed(system, q, qdot, params, "A normal mode"):
+    if held := constrain_closed(system, q, qdot, params, "A normal mode"):
         system, q = held.system, held.require_loaded(q, qdot, params, one_sided_reason("A small oscillation"))
     scene = SceneState.from_state(system, q, qdot, params, sparse=True)
     scene.require_autonomous("A normal mode")
@@ -161,7 +161,7 @@ _BALANCED = 1e-6
 
 
 def _count_independent_constraints(scene: SceneState) -> int:
-    """The number of independent constraints at q; all of them where there are no numbers to ask."""
+    """Return the number of independent constraints at q; if q is traced, of all constraints."""
     if not scene.constrained:
         return 0
     jacobian = scene.jacobian(scene.q, scene.qdot)
@@ -178,7 +178,7 @@ def _count_independent_constraints(scene: SceneState) -> int:
 
 @compile_for_one_call
 def _dense_modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> tuple:
-    """The modes of the k degrees of freedom, and how far q is from an equilibrium."""
+    """Return the modes of the k degrees of freedom, and the distance of q from an equilibrium."""
     scene = SceneState.from_arguments(*arguments)
     q, matrices = scene.q, steady_matrices(scene, scene.q)
     unit = jax.lax.stop_gradient(diagonal_scale(matrices[0]))
@@ -210,8 +210,10 @@ def _dense_modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *argument
 
 @compile_for_one_call
 def _build_modes(layout: Layout, exponents: Array, shapes: Array, weighted: Array, unit: Vector, balanced) -> Modes:
-    """The modes of exponents (k, 2) and shapes x (k, n) in the `unit` (n,) of coordinates, `weighted` their M x (k, n);
-    NaN if not `balanced`."""
+    """Return `Modes` of exponents (k, 2) and shapes x (k, n) in the `unit` (n,) of coordinates; NaN unless `balanced`.
+
+    `weighted` are the M x (k, n).
+    """
     shapes = _normalise_shapes(shapes, weighted)
     order = jnp.argsort(jax.lax.stop_gradient(exponents[:, 0].imag), stable=True)
     shapes = shapes[order] * unit
@@ -225,7 +227,7 @@ def _build_modes(layout: Layout, exponents: Array, shapes: Array, weighted: Arra
 
 
 def _large_modes(scene: SceneState, qdot: PyTree, count: int | None) -> tuple[Modes, Array]:
-    """The `count` lowest modes of a large scene, all of them for None, and how far q is from an equilibrium."""
+    """Return the `count` lowest modes of a large scene, None: all, and the distance of q from an equilibrium."""
     n, motion = scene.layout.size, scene.motion
     state = scene.q, scene.qdot, jnp.zeros((), scene.q.dtype), scene.numbers
     freedoms = n - jax.eval_shape(motion.residual, *state).size
@@ -262,7 +264,7 @@ def _large_modes(scene: SceneState, qdot: PyTree, count: int | None) -> tuple[Mo
 
 @compile_for_one_call
 def _scaled_mass_and_damping(motion: SparseMotion, x: Vector, *state) -> tuple[Array, Vector, Vector]:
-    """The entries of M, the unit (n,) of each coordinate, and ∂F/∂q̇ x in these units."""
+    """Return the entries of M, the unit (n,) of each coordinate, and ∂F/∂q̇ x in these units."""
     (q, qdot, t, numbers), form = state, cast(Any, motion.structure.mass)
     entries, unit = form.read(motion.mass_product(*state), q.dtype), motion.unit(*state)
     return entries, unit, unit * jax.jvp(lambda v: motion.force(q, v, t, numbers), (qdot,), (unit * x,))[1]
@@ -307,7 +309,10 @@ _FURTHER, _BENT = 1e3, 1e-3
 
 
 def _eliminate_cyclic(mass: Matrix, rates: Matrix, stiffness: Matrix, keep: np.ndarray, gone: np.ndarray):
-    """M, C + G, K of the coordinates `keep` at constant momenta of the cyclic `gone`; the part of these in modes."""
+    """Return M, C + G, K of the coordinates `keep` at constant momenta of the cyclic `gone`; and a function that
+
+    computes the amplitudes of these.
+    """
     if not len(gone):
         return (mass, rates, stiffness), lambda moved, exponents: moved[:, :0]
     within, across = np.ix_(keep, keep), np.ix_(keep, gone)
@@ -332,7 +337,7 @@ def _eliminate_cyclic(mass: Matrix, rates: Matrix, stiffness: Matrix, keep: np.n
 
 
 def _reversible_modes(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Array, Array]:
-    """Exponents (k, 2) and real amplitudes (k, k), a mode a column, of K x = ω² M x; NaN if velocities do matter."""
+    """Return exponents (k, 2) and real amplitudes (k, k), in columns, of K x = ω² M x; NaN if velocities matter."""
     squares, shapes = symmetric_modes(stiffness, mass)
     size = jnp.max(jnp.abs(squares))
     zero = _UNITS * len(mass) * jnp.finfo(size.dtype).eps * jax.lax.stop_gradient(size)
@@ -342,7 +347,7 @@ def _reversible_modes(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[A
 
 @compile_for_one_call
 def _exponents_of_squares(squares: Array, zero, ok=True) -> Array:
-    """s = iω, −iω, or κ, −κ, (k, 2), of the squares ω² (k,), of which those up to `zero` are none; NaN if not `ok`."""
+    """Return s = iω, −iω, or κ, −κ, (k, 2), of squares ω² (k,); 0 for those up to `zero`, NaN if not `ok`."""
     rate = jnp.sqrt(jnp.where(jnp.abs(squares) > zero, jnp.abs(squares), 1))
     frequency, growth = jnp.where(squares > zero, rate, 0), jnp.where(squares < -zero, rate, 0)
     frequency, growth = nan_unless(ok, frequency), nan_unless(ok, growth)
@@ -350,7 +355,7 @@ def _exponents_of_squares(squares: Array, zero, ok=True) -> Array:
 
 
 def _general_modes(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Array, Array]:
-    """Two exponents for each mode (k, 2), and the complex amplitudes of the coordinates (k, k), a mode a column."""
+    """Return two exponents for each mode (k, 2), and the complex amplitudes of the coordinates (k, k), in columns."""
     k, inverse = len(mass), factorize(mass)
     by_q, by_qdot = -inverse.solve_columns(stiffness), -inverse.solve_columns(rates)
     fastest = jax.lax.stop_gradient(jnp.maximum(jnp.sqrt(jnp.max(jnp.abs(by_q))), jnp.max(jnp.abs(by_qdot))))
@@ -361,7 +366,7 @@ def _general_modes(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Arra
 
 
 def _normalise_shapes(shapes: Array, weighted: Array) -> Array:
-    """Shapes x (k, n) with xᴴM x = 1 and the largest entry positive; `weighted` (k, n) are the M x."""
+    """Scale shapes x (k, n) to xᴴM x = 1 and a positive largest entry; `weighted` (k, n) are the M x."""
     shapes = shapes / jnp.sqrt(jnp.sum(shapes.conj() * weighted, axis=1, keepdims=True).real).astype(shapes.dtype)
     sizes = jnp.abs(jax.lax.stop_gradient(shapes))
     # The first of those that are equal but for rounding: a symmetric shape has its sign by no accident.

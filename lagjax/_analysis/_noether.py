@@ -1,4 +1,4 @@
-"""`cyclic_coordinates`, `noether_charge`: a symmetry of L, and what it conserves.
+"""`cyclic_coordinates`, `noether_charge`: a symmetry of L, and its conserved quantity.
 
 A point transformation q → q + ε ξ(q, t), t → t + ε τ(q, t) changes L dt by ε Λ dt,
 
@@ -94,7 +94,7 @@ def noether_charge(system: System, generator: Callable, gauge: Callable | None =
 
 
 def flat_generator(generator: Function, layout: Layout) -> Callable:
-    """(ξ (n,), τ ()) as a function of (q (n,), t, params), of a generator in the user's pytree."""
+    """Return the user's generator as a function of (q (n,), t, params) that returns (ξ (n,), τ ())."""
 
     def flat(q, t, params):
         value = generator(layout.restore(q), t=t, params=params)
@@ -118,7 +118,7 @@ def _fits_state(value: PyTree, layout: Layout) -> bool:
 
 
 def charge_at(motion: Motion, transform: Callable, q: Vector, qdot: Vector, t, numbers: PyTree) -> Float[Array, ""]:
-    """p·ξ − h τ of the transformation (ξ, τ) = `transform(q, t)` at a state."""
+    """Return p·ξ − h τ of the transformation (ξ, τ) = `transform(q, t)` at a state."""
     change, of_time = transform(q, t)
     return motion.momentum(q, qdot, t, numbers) @ change - of_time * motion.energy(q, qdot, t, numbers)
 
@@ -127,7 +127,7 @@ def charge_at(motion: Motion, transform: Callable, q: Vector, qdot: Vector, t, n
 
 
 class FlatState(NamedTuple):
-    """A state off the motion as well as on it: q, q̇ and q̈ (n,) are anything, at the time t."""
+    """Arbitrary q, q̇ and q̈ (n,) at the time t: q̈ need not satisfy the equations of motion."""
 
     q: Vector
     qdot: Vector
@@ -136,17 +136,13 @@ class FlatState(NamedTuple):
 
 
 def variation(scene: SceneState, transform: Callable, q: Vector, qdot: Vector, t) -> Float[Array, ""]:
-    """Λ of the transformation (ξ, τ) = `transform(q, t)`."""
-
-    def lagrangian(q, qdot, t):
-        return scene.motion.lagrangian(q, qdot, t, scene.numbers)
-
+    """Return Λ of the transformation (ξ, τ) = `transform(q, t)`."""
     (change, of_time), (rate, rate_of_time) = jax.jvp(transform, (q, t), (qdot, jnp.ones_like(t)))
-    value, moved = jax.jvp(lagrangian, (q, qdot, t), (change, rate - qdot * rate_of_time, of_time))
+    value, moved = jax.jvp(scene.lagrangian, (q, qdot, t), (change, rate - qdot * rate_of_time, of_time))
     return moved + value * rate_of_time
 
 
 def euler_lagrange(function: Callable, state: FlatState) -> tuple[Vector, Vector]:
-    """d/dt ∂Λ/∂q̇ and ∂Λ/∂q (n,) of a function Λ(q, q̇, t): their difference is zero where Λ is some dG(q, t)/dt."""
+    """Return d/dt ∂Λ/∂q̇ and ∂Λ/∂q (n,) of Λ(q, q̇, t): they are equal where Λ is some dG(q, t)/dt."""
     place, onwards = (state.q, state.qdot, state.t), (state.qdot, state.qddot, jnp.ones_like(state.t))
     return jax.jvp(jax.grad(function, argnums=1), place, onwards)[1], jax.grad(function, argnums=0)(*place)

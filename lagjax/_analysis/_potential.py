@@ -1,8 +1,8 @@
-"""Forces that have a potential, as part of L: what is conserved must not depend on where the author wrote them.
+"""Move forces that have a potential into L: conserved quantities must not depend on where the author wrote them.
 
 Forces Q(q, t) are ∂W/∂q of their work W = ∫ Q·dq where ∂Qᵢ/∂qⱼ = ∂Qⱼ/∂qᵢ and nothing depends on q̇. The integral is
-taken from a state of reference along a straight line and along curves beside it, as the line may lead through a centre
-of force; the one that is known best counts.
+taken from a reference state along a straight line and along curves beside it, as the line may pass through a centre of
+force; the most accurate one is used.
 """
 
 from collections.abc import Callable
@@ -28,13 +28,13 @@ _CURL = 1e-12  # of forces, by which they may fail to have a potential: some ten
 
 
 def line_integral(slope: Callable, start: Array, end: Array) -> Array:
-    """∫ slope(q)·dq from `start` to `end`, (n,) or (), along a straight line."""
+    """Return ∫ slope(q)·dq from `start` to `end`, (n,) or (), along a straight line."""
     way = end - start
     return _integral(lambda s: jnp.vdot(slope(start + s * way), way), 1, end.dtype)
 
 
 def _integral(rate: Callable, parts: int, dtype) -> Array:
-    """∫ rate(s) ds from 0 to 1 by Gauss's rule on this many parts."""
+    """Return ∫ rate(s) ds from 0 to 1 by Gauss's rule on this many parts."""
     nodes, shares = np.polynomial.legendre.leggauss(_NODES)
     places = (np.arange(parts)[:, None] + 0.5 * (nodes + 1)).ravel() / parts
     values = jax.vmap(rate)(jnp.asarray(places, dtype))
@@ -42,7 +42,7 @@ def _integral(rate: Callable, parts: int, dtype) -> Array:
 
 
 def _work(force: Callable, start: Array, end: Array, scale: np.ndarray) -> Array:
-    """∫ force(q)·dq from `start` to `end` (n,) by the best of some ways; NaN where none is resolved or they differ."""
+    """Return ∫ force(q)·dq from `start` to `end` (n,) by the best of some curves; NaN if inaccurate or they differ."""
     way, size = end - start, jnp.asarray(scale, end.dtype)
     across = jnp.cos(jnp.arange(1.0, len(scale) + 1)).astype(end.dtype)
     length = jnp.sqrt(jnp.sum((way / size) ** 2))
@@ -68,7 +68,7 @@ def _work(force: Callable, start: Array, end: Array, scale: np.ndarray) -> Array
 
 
 def absorb_potential_forces(scene: SceneState, scales: Scales, states: FlatState) -> SceneState:
-    """The scene with its forces as part of L where they have a potential at all of `states`; else the scene itself."""
+    """Return the scene with its forces in L if they have a potential at all of `states`; else the scene."""
     if scene.motion.forces is None or not _have_potential(scene, scales, states):
         return scene
     system, layout, reference = scene.system, scene.layout, np.asarray(scene.q)
@@ -104,7 +104,7 @@ def _have_potential(scene: SceneState, scales: Scales, states: FlatState) -> boo
 
 @compile_for_one_call
 def _force_and_slopes(states: FlatState, *arguments) -> tuple[Array, Array, Array]:
-    """Q (S, n), ∂Q/∂q and ∂Q/∂q̇ (S, n, n)."""
+    """Return Q (S, n), ∂Q/∂q and ∂Q/∂q̇ (S, n, n)."""
     scene = SceneState.from_arguments(*arguments)
 
     def force_and_derivatives(state):

@@ -1,4 +1,4 @@
-"""Random states about that of a scene, at which identities are tested that hold everywhere or nowhere."""
+"""Random states near that of a scene, at which identities are tested."""
 
 import equinox as eqx
 import jax
@@ -19,7 +19,7 @@ _THIRD = 3  # of this many states one is drawn as far off as it takes for the fo
 
 
 def random_states(scene: SceneState, scales: Scales, count: int, seed: int, piecewise: bool) -> FlatState:
-    """Random states about that of the scene, (count, …) each, on the constraints if there are any."""
+    """Return random states, (count, …) each, near that of the scene, on the constraints if there are any."""
     size, random = scene.layout.size, np.random.default_rng(seed)
     draws, t = random.uniform(-1, 1, (3, count, size)), random.uniform(-1, 1, count)
     beyond = np.where(np.arange(count) % _THIRD, 1.0, scales.reach ** random.uniform(0, 1, count))[:, None]
@@ -37,7 +37,7 @@ def _project_states(q, qdot, t, system, layout, params):
 
 
 def perturb_last_digits(states: FlatState) -> FlatState:
-    """The states with every number moved by a few units in its last place, up or down at random."""
+    """Return the states with every number changed by a few round-offs at random."""
     random = np.random.default_rng(0)
     return FlatState(*(x * (1 + _LAST * np.finfo(float).eps * random.choice([-1.0, 1.0], x.shape)) for x in states))
 

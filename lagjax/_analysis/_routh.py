@@ -79,7 +79,7 @@ def routhian(system: System, q: PyTree, qdot: PyTree, params: PyTree = None) -> 
 
 
 class _CyclicSplit(NamedTuple):
-    """A scene before reduction, and the indices of its coordinates: those `left` and the cyclic ones, `gone`."""
+    """A scene before reduction, with the indices of its coordinates that are `left` and of the cyclic ones, `gone`."""
 
     system: System
     layout: Layout
@@ -94,7 +94,7 @@ class _CyclicSplit(NamedTuple):
         return present(self.system.lagrangian)(self.layout.restore(q), self.layout.restore(qdot), t=t, params=params)
 
     def cyclic_velocity(self, s, sdot, t, params) -> Array:
-        """The velocity ċ (k,) of the cyclic coordinates at the momenta in `params`, those of the reduced scene."""
+        """Return ċ (k,) of the cyclic coordinates from the momenta in `params`, those of the reduced scene."""
         none = jnp.zeros(len(self.gone), self.layout.dtype)
 
         momenta = jax.grad(lambda cdot: self.lagrangian(s, sdot, cdot, t, params["params"]))

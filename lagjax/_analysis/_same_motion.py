@@ -1,4 +1,4 @@
-"""`same_motion`: whether two Lagrangians are of one motion."""
+"""`same_motion`: a test that two Lagrangians have the same motions."""
 
 from typing import NamedTuple
 
@@ -100,7 +100,7 @@ def same_motion(a: System, b: System, q: PyTree, qdot: PyTree, params: PyTree = 
 
 
 def _compare_equations(scenes, states: FlatState) -> tuple[float, np.ndarray, np.ndarray] | None:
-    """The factor f, |E_a − f E_b| over its terms (S, n), and which states are finite (S,); None where few are."""
+    """Return the factor f, |E_a − f E_b| over its terms (S, n), and which states are finite (S,); None if few are."""
     (of_a, size_a), (of_b, size_b) = (map(np.asarray, _residuals(states, *scene.arguments)) for scene in scenes)
     well = np.asarray(np.isfinite(of_a).all(axis=1) & np.isfinite(of_b).all(axis=1))
     if well.sum() < _STATES // 4:
@@ -120,14 +120,11 @@ def _compare_equations(scenes, states: FlatState) -> tuple[float, np.ndarray, np
 
 @compile_for_one_call
 def _residuals(states: FlatState, *arguments) -> tuple[Array, Array]:
-    """E (S, n) and the size of its terms (S, n)."""
+    """Return E (S, n) and the size of its terms (S, n)."""
     scene = SceneState.from_arguments(*arguments)
 
-    def lagrangian(q, qdot, t):
-        return scene.motion.lagrangian(q, qdot, t, scene.numbers)
-
     def equation_and_size(state):
-        rate, by_q = euler_lagrange(lagrangian, state)
+        rate, by_q = euler_lagrange(scene.lagrangian, state)
         force = scene.motion.nonconservative_force(state.q, state.qdot, state.t, scene.numbers)
         return rate - by_q - force, jnp.abs(rate) + jnp.abs(by_q) + jnp.abs(force)
 

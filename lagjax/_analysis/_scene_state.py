@@ -1,4 +1,4 @@
-"""The door of the analysis: a scene with its state and its parameters, flat."""
+"""`SceneState`: a scene with its state and parameters as flat arrays, the input of every analysis."""
 
 from typing import NamedTuple
 
@@ -28,7 +28,7 @@ Vector = Float[Array, " n"]
 
 
 def require_matrices(size: int, what: str, advice: str) -> None:
-    """Raise `ValueError`, with the `advice`, where `what` takes matrices too large for this number of coordinates."""
+    """Raise `ValueError`, with the `advice`, if `what` needs dense matrices too large for `size` coordinates."""
     if size > forms.LARGEST_ANALYSED:
         raise ValueError(
             f"{what}: not tried for {size} coordinates, which takes matrices of n × n numbers, {8e-9 * size**2:.2g} GB "
@@ -37,7 +37,7 @@ def require_matrices(size: int, what: str, advice: str) -> None:
 
 
 class SceneState(NamedTuple):
-    """A scene at one state: its functions on vectors, and the numbers they take."""
+    """A scene at one state, with its equations as functions of vectors."""
 
     system: System
     layout: Layout
@@ -52,7 +52,7 @@ class SceneState(NamedTuple):
     def from_state(
         cls, system: System, q: PyTree, qdot: PyTree | None, params: PyTree, sparse: bool = False
     ) -> "SceneState":
-        """A scene at the state (q, qdot), at rest where `qdot` is None; on arrays if it is `sparse` and large."""
+        """Return the scene at (q, qdot), at rest if `qdot` is None; with `sparse` a large scene stays on arrays."""
         system = require_system(system)
         rest = jax.tree.map(lambda x: jnp.zeros_like(jnp.asarray(x, float)), q) if qdot is None else qdot
         layout = Layout.from_state(q, rest)
@@ -68,7 +68,7 @@ class SceneState(NamedTuple):
 
     @classmethod
     def from_arguments(cls, system: System, layout: Layout, q: Vector, qdot: Vector, params: PyTree) -> "SceneState":
-        """A scene at the flat state q, q̇ (n,), with params of arrays, inside of a compiled function."""
+        """Return the scene at the flat state q, q̇ (n,), for use inside a compiled function."""
         derivation = derivation_of(system, layout, params)
         motion = derivation.motion if system.path == "array" else lowered_motion(derivation)
         return cls(system, layout, motion, derivation, q, qdot, params, eqx.filter(params, eqx.is_array_like))
@@ -83,7 +83,7 @@ class SceneState(NamedTuple):
 
     @property
     def large(self) -> bool:
-        """True if matrices of n × n numbers are not written down, as those of the scene are sparse."""
+        """True if dense n × n matrices are avoided, because those of the scene are sparse."""
         form = self.derivation.form
         if not form.is_sparse or isinstance(form.mass, MatrixFree) or self.layout.size <= forms.LARGEST_ANALYSED_DENSE:
             return False
@@ -115,7 +115,7 @@ class SceneState(NamedTuple):
 
     @property
     def conserved(self) -> tuple[int, ...]:
-        """The coordinates that nothing depends on and nothing acts on, read off the scene's programs."""
+        """The coordinates that no function depends on and no force acts on, read off the scene's programs."""
         if self.derivation.form.is_sparse:
             acts = self.constrained or self.motion.forces is not None or self.motion.dissipation is not None
             return () if acts else self.derivation.unread or ()
@@ -126,8 +126,7 @@ class SceneState(NamedTuple):
 
     @property
     def reversible(self) -> bool:
-        """True if nothing but L acts, and no momentum is left at rest: read off momenta at random states and
-        parameters, zero exactly or not. Its user has to catch a wrong guess."""
+        """True if only L acts and momenta at rest are zero, at random states and parameters: a guess to verify."""
         motion, n = self.motion, self.layout.size
         acting = motion.forces, motion.dissipation, self.system.velocity_constraints
         if any(function is not None for function in acting) or self.lowered is None:
@@ -142,7 +141,7 @@ class SceneState(NamedTuple):
 
     @property
     def scales(self) -> Scales:
-        """The sizes of coordinates, velocities and the time, of a scene of numbers."""
+        """The sizes of coordinates, velocities and the time; the scene must not be traced."""
 
         def evaluated(name, q, qdot):
             if name == "mass_matrix" and self.derivation.form.is_sparse:  # of which the diagonal alone is read
@@ -152,10 +151,13 @@ class SceneState(NamedTuple):
 
         return Scales.from_quantities(evaluated, np.asarray(self.q), np.asarray(self.qdot))
 
+    def lagrangian(self, q: Vector, qdot: Vector, t) -> Float[Array, ""]:
+        return self.motion.lagrangian(q, qdot, t, self.numbers)
+
     # ---- quantities at a state (q, q̇) and the time zero ----
 
     def force(self, q: Vector, qdot: Vector) -> Vector:
-        """F of M q̈ = F + Gᵀλ, (n,)."""
+        """Return F (n,) of M q̈ = F + Gᵀλ."""
         if self.large:
             return self.motion.force(q, qdot, jnp.zeros((), q.dtype), self.numbers)
         return self.motion.mass_matrix_and_force(q, qdot, jnp.zeros((), q.dtype), self.numbers)[1]
@@ -164,16 +166,16 @@ class SceneState(NamedTuple):
         return self.motion.mass_matrix(q, qdot, jnp.zeros((), q.dtype), self.numbers)
 
     def jacobian(self, q: Vector, qdot: Vector) -> Float[Array, "m n"]:
-        """G, (m, n), of m constraints or none."""
+        """Return G (m, n) of the m constraints."""
         return self.motion.constraints.jacobian(q, qdot, jnp.zeros((), q.dtype), self.numbers)
 
     def position_constraints(self, q: Vector) -> Float[Array, " k"]:
-        """f of the constraints f = 0, (k,)."""
+        """Return f (k,) of the constraints f = 0."""
         return self.motion.constraints.f(q, jnp.zeros((), q.dtype), self.numbers)
 
 
 def _require_no_velocities(system: System, q: PyTree, params: PyTree) -> None:
-    """Raise `ValueError` for params that look like velocities in a scene of which no function asks for params."""
+    """Raise `ValueError` if params look like velocities, and no function of the scene takes params."""
     functions = [getattr(system, role) for role in ROLES]
     if params is None or any("params" in function.extras for function in functions if function is not None):
         return

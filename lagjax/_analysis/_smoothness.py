@@ -1,8 +1,8 @@
-"""The smoothness of the forces of a scene at a state: without it nothing is linear next to it.
+"""Checks that the forces of a scene are smooth at a state, which every linearisation requires.
 
 At a jump of the force (dry friction at rest) or a kink (a spring that only pushes, where it begins) the two sides of a
-state have different derivatives, or none. Such places are borders of piecewise functions (`_blame.borders`); whether
-the force is smooth there all the same, as max(q, 0)**2 is, its values on both sides tell.
+state have different derivatives, or none. Such places are borders of piecewise functions (`_blame.borders`); the force
+may still be smooth there, as max(q, 0)**2 is: its values on both sides decide that.
 """
 
 import functools
@@ -28,7 +28,7 @@ _ROUNDING = 1e4  # units of rounding of the force one size away; below it a jump
 
 
 class _Roughness(NamedTuple):
-    """Jumps and kinks of the force along every coordinate, then velocity, and the sides that change there."""
+    """Flags of jumps and kinks of the force along each coordinate and velocity, and the borders that change side."""
 
     jumps: Bool[Array, " 2n"]
     kinks: Bool[Array, " 2n"]
@@ -43,7 +43,7 @@ def is_smooth(scene: SceneState) -> Bool[Array, ""]:
 
 
 def require_smooth(scene: SceneState, what: str) -> None:
-    """Raise `ValueError` where the force jumps or has a kink at the state, naming the coordinate and the line."""
+    """Raise `ValueError` if the force jumps or has a kink at the state, naming the coordinate and the line."""
     if not scene.concrete or not _is_pieced(scene.derivation):
         return
     rough = jax.tree.map(np.asarray, _measure_roughness(scene))

@@ -1,13 +1,14 @@
-"""Newton's method, damped where a root is far, of JAX; its linear systems need be neither symmetric nor regular.
+"""Newton's method in JAX, damped far from a root; its linear systems need be neither symmetric nor regular.
 
-`newton` begins near a root and ends at rounding, `levenberg_marquardt` begins far from one. All steps are those of
-`shortest_solution`, but damped ones, whose matrix is regular. No kernel of LAPACK runs in XLA, where batched ones may
-wait for each other for ever: so these are not the solvers of optimistix, whose steps are QR and LU decompositions. The
-iteration of orbits and paths, `lagjax._analysis.orbits._shooting`, is in NumPy: a trial there is a run of machine code,
-of as many members as still gain.
+`newton` starts near a root and converges to rounding, `levenberg_marquardt` starts far from one. Undamped steps are
+those of `shortest_solution`. No kernel of LAPACK runs in XLA, where batched ones may deadlock: so these are not the
+solvers of optimistix, whose steps are QR and LU decompositions. The iteration of orbits and paths,
+`lagjax._analysis.orbits._shooting`, is in NumPy: a trial there is a run of machine code, of as many members as have not
+converged.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +21,10 @@ Vector = Float[Array, " n"]
 
 
 def shortest_solution(matrix: Matrix, b: Vector, unit: Vector | float = 1.0) -> Vector:
-    """x of A x = b, the shortest in these units (n,) where pivots of the scaled A say that it is singular. Linear in b,
-    with derivatives by both."""
+    """Solve A x = b; if A is singular, by pivots of the scaled A, return the x of least norm in units `unit` (n,).
+
+    Linear in b, with derivatives by A and b.
+    """
     matrix = matrix * unit
     rows, columns = (jax.lax.stop_gradient(scale) for scale in _equilibration_factors(matrix))
     inverse, order, pivots = invert(jax.lax.stop_gradient(rows[:, None] * matrix * columns))
@@ -43,13 +46,15 @@ def shortest_solution(matrix: Matrix, b: Vector, unit: Vector | float = 1.0) -> 
 
 
 def shortest_preimage(linear: Callable[[Vector], Vector], right: Vector, unit: Vector | float = 1.0) -> Vector:
-    """x with linear(x) = right, the shortest one in these units (n,): for the implicit derivative of a root."""
+    """Return the x of least norm, in units (n,), with linear(x) = right: for the implicit derivative of a root."""
     return shortest_solution(jax.vmap(linear, out_axes=1)(jnp.eye(right.size, dtype=right.dtype)), right, unit)
 
 
 def newton(f: Callable[[Vector], Vector], start: Vector, unit: Vector | float = 1.0) -> Vector:
-    """x with f(x) = 0 that Newton's method reaches from `start` (n,), for `jax.lax.custom_root`; look at f(x). A step
-    is halved until f is finite and no larger but for rounding; steps are the shortest in `unit` (n,) where singular."""
+    """Return x with f(x) = 0 by Newton's method from `start` (n,), for `jax.lax.custom_root`; the caller checks f(x).
+
+    A step is halved until f is finite and no larger but for rounding; singular steps are of least norm in `unit` (n,).
+    """
 
     def moves(carry):
         _, moved, count = carry
@@ -70,23 +75,25 @@ def newton(f: Callable[[Vector], Vector], start: Vector, unit: Vector | float = 
 def is_root(
     f: Callable, x: Vector, given: Vector | float = 0.0, *, least: Vector | float = 0.0, power: float = 0.6
 ) -> Bool[Array, ""]:
-    """True if f(x) = 0: each number within eps^`power` of what x makes of it, or of a term that is `given` (n,);
-    `least` (n,) bounds sizes of x from below. Newton's method ends at some eps; an astray one is off by half of the
-    digits."""
+    """True if f(x) = 0: each number within eps^`power` of the size of its terms, |∂f/∂x| |x| + |given|.
+
+    `least` (n,) bounds |x| from below. Newton's method converges to some eps; if it goes astray, half of the digits
+    differ.
+    """
     size = jnp.abs(jax.jacfwd(f)(x)) @ jnp.maximum(least, jnp.abs(x)) + jnp.abs(given)
     return jnp.all(jnp.abs(f(x)) <= jnp.finfo(x.dtype).eps ** power * size)
 
 
 def levenberg_marquardt(f: Callable, start: Vector, least: Vector, unit: Vector) -> Vector:
-    """z (n,) after damped steps from `start` for the least |f(z)|², f (m,), until they are small or nothing helps.
+    """Minimise |f(z)|², f (m,), from `start` by damped steps; return z (n,) when they are small or no longer help.
 
     `least` (n,) are the sizes below which numbers of z do not count, `unit` (n,) units in which they compare.
 
-    Rows are weighed by the size of their gradient at the start, columns by the largest they had so far (Moré): a
-    change of units changes nothing. The damping goes down with |r|, which keeps the convergence quadratic where
-    solutions are not isolated (Fan & Yuan, Computing 74 (2005) 23).
+    Rows are weighted by the size of their gradient at the start, columns by the largest they had so far (Moré): the
+    user's units do not matter. The damping goes down with |r|, which keeps the convergence quadratic where solutions
+    are not isolated (Fan & Yuan, Computing 74 (2005) 23).
     """
-    weights = _reciprocal(jnp.sqrt(jnp.sum((jax.jacfwd(f)(start) * unit) ** 2, axis=1)))
+    weights = reciprocal(jnp.sqrt(jnp.sum((jax.jacfwd(f)(start) * unit) ** 2, axis=1)))
 
     def weighted(z):
         return weights * f(z)
@@ -113,7 +120,7 @@ def levenberg_marquardt(f: Callable, start: Vector, least: Vector, unit: Vector)
         damping = jnp.where(ratio > 0.75, damping / 4, jnp.where((ratio < 0.25) | ~better, damping * 4, damping))
         # The most that a step makes of a number of f(z), as a fraction of what the numbers of z make of it.
         of_f, sizes = jnp.abs(jacobian), jnp.maximum(jnp.maximum(least, jnp.abs(z)), jnp.abs(step))
-        length = jnp.max(of_f @ jnp.abs(step) * _reciprocal(of_f @ sizes))
+        length = jnp.max(of_f @ jnp.abs(step) * reciprocal(of_f @ sizes))
         stuck = ~better & ((length < NO_STEP) | ~jnp.isfinite(length))
         moved = jnp.where(better, length, jnp.where(stuck, 0.0, moved))
         return jnp.where(better, z + step, z), jnp.where(better, new, value), moved, damping, scale, count + 1
@@ -145,10 +152,12 @@ STEPS, HALVINGS = 50, 30
 
 
 def _equilibration_factors(matrix: Matrix) -> tuple[Vector, Vector]:
-    """Factors of the rows and of the columns that give each a largest entry of 1; 1 for those of zeros."""
-    rows = _reciprocal(jnp.max(jnp.abs(matrix), axis=1))
-    return rows, _reciprocal(jnp.max(jnp.abs(rows[:, None] * matrix), axis=0))
+    """Return factors of the rows and of the columns that scale the largest entry of each to 1; 1 for zero rows."""
+    rows = reciprocal(jnp.max(jnp.abs(matrix), axis=1))
+    return rows, reciprocal(jnp.max(jnp.abs(rows[:, None] * matrix), axis=0))
 
 
-def _reciprocal(size: Vector) -> Vector:
-    return jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
+def reciprocal(size: Any) -> Any:
+    """Return 1/x of sizes (n,), of NumPy or JAX; 1 where x is zero."""
+    xp = size.__array_namespace__()
+    return xp.where(size > 0, 1 / xp.where(size > 0, size, 1), 1)

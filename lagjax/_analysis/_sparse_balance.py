@@ -1,8 +1,8 @@
-"""The balance of forces of a large scene at rest, F + Gᵀλ and f, its sparse derivative by z = (q, λ), and its roots.
+"""The equilibrium equations of a large scene, F + Gᵀλ = 0 and f = 0, their sparse Jacobian by z = (q, λ), and roots.
 
-It is for scenes with a `SparseStructure`. Derivatives are read off by products (`sparse_jacobian`) and solved by
+It is for scenes with a `SparseStructure`. Derivatives are computed from products (`sparse_jacobian`), linear systems by
 SuperLU on the host, so that nothing here is traced. The steps are those of `_solve`: damped ones until they are small,
-then those of Newton's method; but a step along which the derivative is singular is that of the least damping.
+then those of Newton's method; a singular Newton step is replaced by one of the least damping.
 """
 
 from collections.abc import Callable
@@ -17,14 +17,14 @@ from scipy.sparse.linalg import splu
 
 from lagjax._analysis._lowest_modes import Sparse, factorize_regular, lowest_shift
 from lagjax._analysis._scene_state import SceneState
-from lagjax._analysis._solve import DAMPED_STEPS, NO_STEP
+from lagjax._analysis._solve import DAMPED_STEPS, NO_STEP, reciprocal
 from lagjax._equations import sparse_jacobian
 
 Unknowns = Float[np.ndarray, " n+m"]
 
 
 class SparseBalance(NamedTuple):
-    """`residual(z)` (n + m,): F + Gᵀλ, then f; `jacobian(z)`, sparse; `multipliers` (m,) at the state of the scene."""
+    """The residual (n + m,), F + Gᵀλ then f, its sparse Jacobian, and λ (m,) at the state of the scene."""
 
     residual: Callable[[Unknowns], Unknowns]
     jacobian: Callable[[Unknowns], Sparse]
@@ -32,7 +32,7 @@ class SparseBalance(NamedTuple):
 
 
 def balance_of(scene: SceneState, what: str) -> SparseBalance:
-    """The balance of a large scene. Raises `ValueError`, about `what` it is for, where it is not tried."""
+    """Return the equations of a large scene; raise `ValueError`, about `what` they are for, if not possible."""
     motion, n = scene.motion, scene.layout.size
     large = f"{what} of {n} coordinates is found with sparse matrices on the host"
     if not scene.concrete:
@@ -60,7 +60,7 @@ def balance_of(scene: SceneState, what: str) -> SparseBalance:
 
 
 def multipliers_at_rest(scene: SceneState) -> np.ndarray:
-    """λ (m,) of a scene at rest at q, as the motion from there has it."""
+    """Return λ (m,) of a scene at rest at q, as in a motion that starts there."""
     if not scene.constrained:
         return np.zeros(0)
     state = scene.q, jnp.zeros_like(scene.q), jnp.zeros((), scene.q.dtype), scene.numbers
@@ -71,7 +71,7 @@ def multipliers_at_rest(scene: SceneState) -> np.ndarray:
 
 
 def constraints_nearby(scene: SceneState, place: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """q (n,) on, or nearer to, the constraints f of a large scene than a `place` (n,)."""
+    """Return a q (n,) that satisfies, or nearly, the constraints f of a large scene, near `place` (n,)."""
     function = jax.jit(scene.position_constraints)
     if (jacobian := sparse_jacobian(function, (scene.q,))) is None:
         return place
@@ -79,9 +79,9 @@ def constraints_nearby(scene: SceneState, place: np.ndarray, unit: np.ndarray) -
 
 
 def descend(residual: Callable, jacobian_at: Callable, start: Unknowns, least: Unknowns, unit: Unknowns) -> Unknowns:
-    """z (n,) after damped steps from `start` for the least |f(z)|², f (m,), as in `_solve`."""
+    """Minimise |f(z)|², f (m,), from `start` (n,) by damped steps, as `_solve.levenberg_marquardt`; return z."""
     z, value, jacobian = start, np.asarray(residual(start)), jacobian_at(start)
-    weights = _reciprocal(_column_lengths(jacobian @ diags_array(unit), 1))
+    weights = reciprocal(_column_lengths(jacobian @ diags_array(unit), 1))
     damping, scale = 0.1, np.zeros(len(z))
     for _ in range(DAMPED_STEPS):
         weighted, error = diags_array(weights) @ jacobian, weights * value
@@ -98,7 +98,7 @@ def descend(residual: Callable, jacobian_at: Callable, start: Unknowns, least: U
         ratio, better = gain / expected if expected > 0 else 0.0, gain > 0 and np.isfinite(new).all()
         damping *= 0.25 if ratio > 0.75 else 4.0 if ratio < 0.25 or not better else 1.0
         change, sizes = abs(weighted) @ np.abs(step / d), np.maximum(np.abs(z), np.abs(step / d))
-        length = np.max(change * _reciprocal(abs(weighted) @ np.maximum(least, sizes)))
+        length = np.max(change * reciprocal(abs(weighted) @ np.maximum(least, sizes)))
         if better:
             z, value, jacobian = z + step / d, new, jacobian_at(z + step / d)
         if not length >= NO_STEP:
@@ -107,13 +107,13 @@ def descend(residual: Callable, jacobian_at: Callable, start: Unknowns, least: U
 
 
 def is_balanced(of: SparseBalance, z: Unknowns, least: Unknowns) -> bool:
-    """True if z is a root, each number within half of the digits of what the numbers of z make of it."""
+    """True if z is a root: each residual is below √eps times the sum of its terms."""
     size = abs(of.jacobian(z)) @ np.maximum(least, np.abs(z))
     return bool((np.abs(of.residual(z)) <= np.finfo(float).eps ** 0.5 * size).all())
 
 
 def falls(of: SparseBalance, z: Unknowns, unit: np.ndarray) -> bool:
-    """True if an equilibrium is no minimum of the potential on the constraints, with coordinates in their `unit`."""
+    """True if an equilibrium is no minimum of the potential on the constraints; `unit`: of each coordinate."""
     whole, n, scale = of.jacobian(z), len(unit), diags_array(unit)
     forces, jacobian = scale @ whole[:n, :n] @ scale, whole[n:, :n] @ scale
     shift = lowest_shift(-0.5 * (forces + forces.T), eye_array(n), jacobian)[0]
@@ -125,7 +125,7 @@ _FALLS = 1e-7
 
 
 def _damped_solution(matrix: Sparse, b: np.ndarray, damping: float) -> np.ndarray:
-    """x of the least |A x − b|² + `damping` |x|²; A is not multiplied by itself."""
+    """Return the x that minimises |A x − b|² + `damping` |x|², without forming AᵀA."""
     m, n = matrix.shape
     above, below = (damping**0.5 * eye_array(k) for k in (m, n))
     bordered = block_array([[above, matrix], [matrix.T, -below]], format="csc")
@@ -136,12 +136,8 @@ def _column_lengths(matrix: Sparse, axis: int) -> np.ndarray:
     return np.sqrt((matrix**2).sum(axis=axis))
 
 
-def _reciprocal(x: np.ndarray) -> np.ndarray:
-    return np.where(x > 0, 1 / np.where(x > 0, x, 1), 1)
-
-
 def singular_direction(matrix: Sparse) -> np.ndarray | None:
-    """x of unit length with A x = 0 to working precision, for a square A; None where A is regular."""
+    """Return a unit vector x with A x = 0 to working precision, for a square A; None if A is regular."""
     if factorize_regular(matrix) is not None:
         return None
     x = np.random.default_rng(0).normal(size=matrix.shape[0])

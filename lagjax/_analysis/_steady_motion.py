@@ -1,4 +1,4 @@
-"""`steady_motion`: where a scene moves on as it is, with cyclic coordinates at constant velocities."""
+"""`steady_motion`: motions in which cyclic coordinates have constant velocities and the others are constant."""
 
 from typing import Any, NamedTuple
 
@@ -114,7 +114,7 @@ def steady_motion(
 
 
 def _held_coordinates(scene: SceneState, hold: Any) -> np.ndarray:
-    """The coordinates and the velocities (2, n) that `hold` names. Raises an error for what names none."""
+    """Return the coordinates and velocities (2, n) that `hold` names; raise if a name is none of them."""
     names = scene.layout.names
     both = names, tuple(f"qdot{name.removeprefix('q')}" for name in names)
     chosen = np.zeros((2, len(names)), bool)
@@ -130,7 +130,7 @@ def _held_coordinates(scene: SceneState, hold: Any) -> np.ndarray:
 
 
 def _held_unknowns(scene: SceneState, chosen: np.ndarray, cyclic: np.ndarray, moves: np.ndarray) -> np.ndarray:
-    """The unknowns (n,) that are held: velocities of `cyclic` coordinates, places of the others."""
+    """Return the unknowns (n,) that are held: velocities of `cyclic` coordinates, positions of the others."""
     for k in np.flatnonzero(chosen[1] & ~moves.any(axis=1)):
         if scene.concrete and scene.qdot[k] != 0:
             name = scene.layout.names[k]

@@ -1,6 +1,7 @@
-"""The directions along which a scene looks the same at every place, also where velocities have to turn with them.
+"""The directions in configuration space along which a scene is invariant, if velocities are rotated with them.
 
-A direction d of the coordinates is one if a matrix Ω of the velocities of those that nothing reads leaves all as it is,
+A direction d of the coordinates is one if a matrix Ω, of the velocities of coordinates that no function reads,
+satisfies
 
     ∂L/∂q d + p·Ωq̇ = 0,   ∂Q/∂q d + (∂Q/∂q̇) Ωq̇ + ΩᵀQ = 0,   ∂f/∂q d = 0,   ∂a/∂q d + (∂a/∂q̇) Ωq̇ = 0 where a = 0
 
@@ -29,8 +30,10 @@ _DIFFERENTIATED = "nonconservative_force", "residual"
 
 
 class SteadySymmetries(NamedTuple):
-    """The `cyclic` coordinates (n,), one for each direction. With a cyclic coordinate i others move as `moves[:, i]`
-    (n, n) says, itself by 1, and velocities turn by Ω = `turns[i]` (n, n, n)."""
+    """The `cyclic` coordinates (n,), one for each direction; with coordinate i the others move by `moves[:, i]`
+
+    (n, n), itself by 1, and velocities rotate by Ω = `turns[i]` (n, n, n).
+    """
 
     cyclic: np.ndarray
     moves: np.ndarray
@@ -51,8 +54,10 @@ class _Terms(NamedTuple):
 
 
 def find_symmetries(scene: SceneState, preferred: np.ndarray) -> SteadySymmetries:
-    """The symmetries about the state of a scene; where its numbers are traced, about random ones. Of coordinates that
-    move together a `preferred` one (n,) is cyclic."""
+    """Return the symmetries at the state of a scene; if it is traced, at random numbers.
+
+    Of coordinates that move together a `preferred` one (n,) is cyclic.
+    """
     n, random = scene.layout.size, np.random.default_rng(2)
     params = jax.tree.map(
         lambda x: x if is_concrete(x) else random.uniform(0.3, 1.2, x.shape).astype(x.dtype), scene.params
@@ -81,7 +86,7 @@ def find_symmetries(scene: SceneState, preferred: np.ndarray) -> SteadySymmetrie
 
 
 def _terms(scene: SceneState, params, steps: tuple, q: np.ndarray, qdot: np.ndarray) -> tuple[_Terms, np.ndarray]:
-    """The terms at states (S, n), by central differences where derivatives of the second order are asked for, and a."""
+    """Return the terms at states (S, n), with second derivatives by central differences; and a."""
 
     def evaluate(y, *names):
         sample = Sample.from_scene(scene.system, scene.layout, *halves(y.reshape(-1, y.shape[-1])), 0.0, params)
@@ -104,8 +109,10 @@ def _terms(scene: SceneState, params, steps: tuple, q: np.ndarray, qdot: np.ndar
 
 
 def _solve_identities(of: _Terms, qdot, consistent, of_q, units) -> SteadySymmetries:
-    """The symmetries by terms at states with velocities `qdot` (S, n), which for those of a are `consistent`; `of_q`
-    (n,) are sizes of coordinates, and that with the largest of the `units` (n,) is taken where some move together."""
+    """Solve for the symmetries, given terms at states with velocities `qdot` (S, n), `consistent` ones for a.
+
+    `of_q` (n,) are sizes of coordinates; of coordinates that move together that with the largest unit is cyclic.
+    """
     n = qdot.shape[1]
     right = [x.reshape(-1, n) for x in (of.lagrangian_by_q, of.force_by_q, of.place_by_q, of.rate_by_q)]
     unread = np.logical_and.reduce([(x == 0).all(axis=0) for x in right])

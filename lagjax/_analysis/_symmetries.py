@@ -1,8 +1,9 @@
-"""`conserved_quantities`: which transformations are symmetries of L, and what they conserve.
+"""`conserved_quantities`: the symmetries of L among given transformations, and their conserved quantities.
 
-A change Λ of L is some dG(q, t)/dt if and only if its Euler–Lagrange expression is zero, whatever q, q̇ and q̈ are. Λ is
-linear in the transformation, so symmetries are the null space of a matrix: a column for each transformation, rows for
-the expression of each coordinate at random states, and for the work of forces and constraints. No G need be guessed.
+A change Λ of L is some dG(q, t)/dt if and only if its Euler–Lagrange expression is zero, whatever q, q̇ and q̈ are. Λ
+is linear in the transformation, so symmetries are the null space of a matrix: a column for each transformation, rows
+for the expression of each coordinate at random states, and for the work of forces and constraints. No G need be
+guessed.
 
     random states ─► columns ─► null space ─► named ones, then the rest ─► verified on the motion at fresh states
 """
@@ -175,7 +176,7 @@ def conserved_quantities(
 def _approximate_symmetries(
     measured: "_SymmetryColumns", space: np.ndarray, known: list[tuple[str, np.ndarray]]
 ) -> list[str]:
-    """Sentences about the named transformations in `known` that are broken, but by less than `_NEARLY`."""
+    """Return a sentence for each transformation in `known` that is broken by less than `_NEARLY`."""
     rows, taken, notes = np.concatenate([measured.of_lagrangian, measured.of_others]), space, []
     for name, weights in known:
         unit = weights / np.linalg.norm(weights)
@@ -193,20 +194,20 @@ _DEPENDENT = (_COMBINATION, "dilation")
 
 
 class _SymmetryColumns(NamedTuple):
-    """The columns of L and of forces and constraints at states, (rows, K) each, and what rounding may leave of them."""
+    """The matrix of the changes of L, and of forces and constraints, (rows, K) each, and its rounding error."""
 
     of_lagrangian: np.ndarray
     of_others: np.ndarray
     threshold: float
 
     def symmetries(self, *columns: np.ndarray) -> np.ndarray:
-        """An orthonormal basis (K, d) of the combinations of columns that are zero."""
+        """Return an orthonormal basis (K, d) of the null space of these columns."""
         rows = np.concatenate(columns)
         return decide(rows, absolute=self.threshold * np.sqrt(len(rows))).null
 
 
 def _measure_columns(scene: SceneState, fields: Fields, states: FlatState) -> _SymmetryColumns:
-    """The finite rows of the columns, and their noise: how much they differ between nearly equal states."""
+    """Return the finite rows of the matrix, and their rounding error, from nearly equal states."""
     both = states, perturb_last_digits(states)
     here, beside = (
         _select_finite_rows(*map(np.asarray, _symmetry_columns(fields, at, *scene.arguments))) for at in both
@@ -229,12 +230,11 @@ def _flatten_generators(generators, layout: Layout) -> dict[str, Callable]:
 
 @compile_for_one_call
 def _symmetry_columns(fields: Fields, states: FlatState, *arguments) -> tuple[Array, Array]:
-    """The change under each of K transformations at S states: of L (S, n, K), of forces and constraints (S, r, K). Both
-    in units of the terms that would have to cancel, so that entries are of order one unless there is a symmetry."""
-    scene = SceneState.from_arguments(*arguments)
+    """Return the change by each of K transformations at S states: of L (S, n, K), of forces, constraints (S, r, K).
 
-    def lagrangian(q, qdot, t):
-        return scene.motion.lagrangian(q, qdot, t, scene.numbers)
+    Both are relative to the terms that would have to cancel: of order one unless there is a symmetry.
+    """
+    scene = SceneState.from_arguments(*arguments)
 
     def expressions_at(state):
         def expression(weights):
@@ -244,7 +244,7 @@ def _symmetry_columns(fields: Fields, states: FlatState, *arguments) -> tuple[Ar
 
         none, each = jnp.zeros(fields.count, state.q.dtype), jnp.eye(fields.count, dtype=state.q.dtype)
         of_l, of_others = jax.vmap(jax.linearize(expression, none)[1], out_axes=-1)(each)
-        return of_l, of_others, sum(map(jnp.abs, euler_lagrange(lagrangian, state)))
+        return of_l, of_others, sum(map(jnp.abs, euler_lagrange(scene.lagrangian, state)))
 
     of_l, of_others, terms = jax.lax.map(expressions_at, states)
     size = jnp.sqrt(jnp.nanmean(terms**2, axis=0))[:, None]
@@ -253,7 +253,7 @@ def _symmetry_columns(fields: Fields, states: FlatState, *arguments) -> tuple[Ar
 
 
 def _work_and_drift(scene: SceneState, transform: Callable, state: FlatState) -> Array:
-    """The work of forces on ξ − q̇ τ (1,) or (0,), and the rates (m,) at which it leaves constraints."""
+    """Return the work of forces on ξ − q̇ τ, (1,) or (0,), and the rates (m,) of change of the constraints."""
     (change, of_time), place = transform(state.q, state.t), (state.q, state.qdot, state.t, scene.numbers)
     moved = change - state.qdot * of_time
     rows = [jnp.zeros(0, state.q.dtype)]
@@ -265,7 +265,7 @@ def _work_and_drift(scene: SceneState, transform: Callable, state: FlatState) ->
 
 
 def _select_finite_rows(of_lagrangian: np.ndarray, of_others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rows (rows, K) of states where all is finite. Raises `ValueError` where there are too few of them."""
+    """Return the rows (rows, K) of finite states; raise `ValueError` if there are too few."""
     well = np.asarray(np.isfinite(of_lagrangian).all(axis=(1, 2)) & np.isfinite(of_others).all(axis=(1, 2)))
     if well.sum() < max(4, len(well) // 4):
         raise ValueError(
@@ -282,7 +282,7 @@ def _select_finite_rows(of_lagrangian: np.ndarray, of_others: np.ndarray) -> tup
 def _choose_basis(
     space: np.ndarray, known: list[tuple[str, np.ndarray]], fields: Fields, names: tuple[str, ...]
 ) -> list[tuple[str, np.ndarray]]:
-    """A basis of the space: those of the known vectors that lie in it, then combinations of few parts."""
+    """Return a basis of `space`: the vectors of `known` that lie in it, then combinations of few parts."""
     chosen, taken = [], np.zeros((len(space), 0))
     for name, weights in known:
         unit = weights / np.linalg.norm(weights)
@@ -297,19 +297,19 @@ def _choose_basis(
 
 
 def _normalise_weights(weights: np.ndarray, fields: Fields) -> np.ndarray:
-    """The weights in the units of q and t: the largest entry of α, b, c, A, β is 1."""
+    """Scale the weights so that in the user's units the largest entry of α, b, c, A, β is 1."""
     return weights / max(np.abs(x).max(initial=0) for x in _restore_units(weights, fields))
 
 
 def _restore_units(weights: np.ndarray, fields: Fields) -> tuple:
-    """A combination (K,) in the user's units: α, b (n,), c (n,), A (n, n), β, and the weights of the user's own."""
+    """Convert weights (K,) to the user's units: α, b (n,), c (n,), A (n, n), β, and those of the user's generators."""
     alpha, b, c, of_maps, beta, own = fields.split_weights(weights)
     shift, drift = b * fields.scale, c * fields.scale / fields.time
     return alpha * fields.time, shift, drift, np.tensordot(of_maps, fields.maps, 1), beta, own
 
 
 def _describe_combination(weights: np.ndarray, fields: Fields, names: tuple[str, ...]) -> str:
-    """A combination in words: its six largest parts, in units of the coordinates, in an order that has no units."""
+    """Return the six largest parts of a combination as text, relative to the sizes of coordinates."""
     alpha, b, c, a, beta, own = _restore_units(_normalise_weights(weights, fields), fields)
     scale, time = fields.scale, fields.time
     parts = [(alpha, 1 / time, "time translation"), (beta, 1.0, "scaling of the time")]
@@ -336,7 +336,7 @@ def _describe_combination(weights: np.ndarray, fields: Fields, names: tuple[str,
 def _conserved_quantities(
     scene: SceneState, fields: Fields, chosen: list, states: FlatState
 ) -> tuple[list[Conserved], list[str]]:
-    """The conserved quantities of the chosen symmetries, and what is to be said about others."""
+    """Return the conserved quantities of the chosen symmetries, and notes on those without one."""
     quantities, notes = [], []
     if not chosen:
         return quantities, notes
@@ -352,8 +352,10 @@ def _conserved_quantities(
 
 
 def _select_independent_charges(names: list[str], gradients: np.ndarray) -> list[int]:
-    """The charges to keep of D with these gradients (S, D, 2n): combinations and dilations are dropped whose gradients
-    lie in the span of the others at every state, as the angular momentum of the centre of mass."""
+    """Return the indices of independent charges among D with these gradients (S, D, 2n).
+
+    Combinations and dilations are dropped if their gradients lie in the span of the others at every state.
+    """
     kept = [k for k, name in enumerate(names) if not name.startswith(_DEPENDENT)]
     for k in range(len(names)):
         if k not in kept and any(_independent_part(of_state[kept], of_state[k]) > 1e-6 for of_state in gradients):
@@ -362,7 +364,7 @@ def _select_independent_charges(names: list[str], gradients: np.ndarray) -> list
 
 
 def _independent_part(rows: np.ndarray, row: np.ndarray) -> float:
-    """The share, 0 to 1, of the length of `row` (2n,) that is orthogonal to the span of `rows` (k, 2n)."""
+    """Return the fraction, 0 to 1, of the length of `row` (2n,) that is orthogonal to the span of `rows` (k, 2n)."""
     size = np.linalg.norm(row)
     if not len(rows) or size == 0:
         return float(size > 0)
@@ -373,7 +375,7 @@ def _independent_part(rows: np.ndarray, row: np.ndarray) -> float:
 
 
 def _noether_charge(scene: SceneState, fields: Fields, weights: np.ndarray, gauge: Callable | None) -> Callable:
-    """p·ξ − h τ − G of the symmetry with these weights (K,)."""
+    """Return the function p·ξ − h τ − G of the symmetry with these weights (K,)."""
     system, layout = scene.system, scene.layout
 
     @accepts_singles(("q", "qdot"), ("t", "params"))

@@ -1,9 +1,9 @@
-"""The transformations among which symmetries are looked for, as vectors of coefficients.
+"""The transformations among which symmetries are searched, as vectors of coefficients (weights).
 
     ξ = b + c t + A q,   τ = α + β t,   and the user's own
 
 For few coordinates every matrix A is tried; for many only those that a leaf of the coordinates suggests: rotations in
-the planes of its last axis and its scaling, for each leaf. A symmetry is any combination of them.
+the planes of its last axis and its scaling, for each leaf. A symmetry is any linear combination of them.
 """
 
 import itertools
@@ -21,7 +21,7 @@ _SPACE = (2,), (3,)  # last axes of leaves that are vectors, which can be rotate
 
 
 class Fields(NamedTuple):
-    """A basis of transformations of n coordinates: the time, n translations, n boosts, M maps, the time's scale, own.
+    """A basis of K transformations of n coordinates: time shift, translations, boosts, maps A, time scale, the user's.
 
     - `scale` (n,), `time`: the sizes of the coordinates and of the time, by which transformations are of order one.
     - `maps` (M, n, n): the matrices A; `names`: of all K = 2 + 2n + M + U.
@@ -46,7 +46,7 @@ class Fields(NamedTuple):
         return weights[0], shift, drift, weights[first:last], weights[last], weights[last + 1 :]
 
     def transform(self, weights, params) -> Callable:
-        """The combination of all with these weights (K,), a function (q, t) → (ξ, τ)."""
+        """Return the linear combination with these weights (K,), a function (q, t) → (ξ, τ)."""
         alpha, b, c, of_maps, beta, of_own = self.split_weights(weights)
 
         def combined(q, t):
@@ -60,7 +60,7 @@ class Fields(NamedTuple):
         return combined
 
     def weights(self, b=None, c=None, a=None, alpha: float = 0.0, beta: float = 0.0) -> np.ndarray | None:
-        """The weights (K,) of one transformation; None where it is no combination of the basis."""
+        """Return the weights (K,) of one transformation; None if it is no combination of the basis."""
         n, m = len(self.scale), len(self.maps)
         of_maps = np.zeros(m)
         if a is not None:
@@ -74,7 +74,7 @@ class Fields(NamedTuple):
 
 
 def fields_of(layout: Layout, scale: np.ndarray, time: float, own: dict[str, Callable]) -> Fields:
-    """The basis for coordinates of this layout, of these sizes (n,) and of this one of the time."""
+    """Return the basis for this layout, given the sizes (n,) of coordinates and of the time."""
     named, maps = zip(*_transformation_maps(layout, scale), strict=True)
     moved = [f"{how} of {name}" for how in ("translation", "boost") for name in layout.names]
     names = "time translation", *moved, *named, "scaling of the time", *own
@@ -97,7 +97,7 @@ def _transformation_maps(layout: Layout, scale: np.ndarray) -> list[tuple[str, n
 
 
 def _leaf_places(layout: Layout) -> list[np.ndarray]:
-    """The places of coordinates in the flat vector, in the shape of each leaf."""
+    """Return the indices of coordinates in the flat vector, in the shape of each leaf."""
     return jax.tree.leaves(layout.restore(np.arange(layout.size)))
 
 
@@ -105,7 +105,7 @@ def _leaf_places(layout: Layout) -> list[np.ndarray]:
 
 
 def textbook_symmetries(layout: Layout, fields: Fields) -> list[tuple[str, np.ndarray]]:
-    """Combinations that textbooks name: the name of what they conserve, and their weights (K,)."""
+    """Return (name of the conserved quantity, weights (K,)) of the transformations that textbooks name."""
     n, axes, first_own = layout.size, _vector_axes(layout), fields.count - len(fields.own)
     one, each = np.eye(n), [(i, d, vectors[:, i]) for d, vectors in axes.items() for i in range(d)]
     along = [(i, d, np.isin(np.arange(n), places).astype(float)) for i, d, places in each]
@@ -125,7 +125,7 @@ def textbook_symmetries(layout: Layout, fields: Fields) -> list[tuple[str, np.nd
 
 
 def _vector_axes(layout: Layout) -> dict[int, np.ndarray]:
-    """The vectors of all leaves whose last axis is 2 or 3 long, places (vectors, d), by d."""
+    """Return {d: indices (vectors, d)} of all 2- and 3-vectors, leaves whose last axis has length d."""
     vectors = {}
     for place in _leaf_places(layout):
         if place.shape[-1:] in _SPACE:
@@ -134,7 +134,7 @@ def _vector_axes(layout: Layout) -> dict[int, np.ndarray]:
 
 
 def _rotations(layout: Layout, axes: dict[int, np.ndarray]) -> list[tuple[str, np.ndarray]]:
-    """Rotations of all vectors together; of two coordinates that are numbers where there are few."""
+    """Return rotations of all vectors together; with few coordinates also of pairs of scalar ones."""
     n, rotations = layout.size, []
     for d, vectors in axes.items():
         for i, j in itertools.combinations(range(d), 2):
@@ -146,7 +146,7 @@ def _rotations(layout: Layout, axes: dict[int, np.ndarray]) -> list[tuple[str, n
 
 
 def _rotation(n: int, first, second) -> np.ndarray:
-    """A (n, n) that turns the coordinates at the places `first` into those at `second`."""
+    """Return A (n, n) that rotates the coordinates `first` into `second`."""
     a = np.zeros((n, n))
     a[first, second], a[second, first] = -1.0, 1.0
     return a

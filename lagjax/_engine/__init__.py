@@ -17,4 +17,4 @@ from lagjax._engine._problem import (
     concatenate_leaves,
     rows,
 )
-from lagjax._engine._stop_reason import AHEAD
+from lagjax._engine._stop_reason import AHEAD, End, find_stop_flags

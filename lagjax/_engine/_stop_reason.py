@@ -43,7 +43,7 @@ class End(NamedTuple):
 
 
 @np.errstate(all="ignore")
-def what_stopped(acceleration: Callable, at: End, shrank, spent) -> tuple[jax.Array, jax.Array]:
+def find_stop_flags(acceleration: Callable, at: End, shrank, spent) -> tuple[jax.Array, jax.Array]:
     """Two flags per member: the acceleration is not finite just ahead; it jumps there.
 
     `acceleration(t, y)` gives q̈, with a last axis of n. `shrank` flags the members whose step became too small,

@@ -13,11 +13,12 @@ function that are not finite or piecewise, with their source line.
 """
 
 from lagjax._equations import _form as forms
-from lagjax._equations._blame import borders_of_motion, describe_pieces, offenders, pieces_of_motion, poles
+from lagjax._equations._accelerations import Accelerations
+from lagjax._equations._blame import borders, borders_of_motion, describe_pieces, offenders, pieces_of_motion, poles
 from lagjax._equations._consistency import has_constraints, inconsistent_members, require_consistent
 from lagjax._equations._constraints import ROUNDINGS, Constraints, distances, is_inconsistent
 from lagjax._equations._coupled_forces import CoupledForces, couple_forces
-from lagjax._equations._derivation import Derivation, derivation_of, numbers_of, once_for_structure
+from lagjax._equations._derivation import Derivation, columns_of, derivation_of, numbers_of, once_for_structure
 from lagjax._equations._linear import (
     augment,
     dependent_rows,
@@ -28,6 +29,7 @@ from lagjax._equations._linear import (
     least_norm,
     null_directions,
     rank,
+    rank_tolerance,
     saddle,
     saddle_many,
     schur_complements,
@@ -45,8 +47,9 @@ from lagjax._equations._many_states import (
     sparse_spectrum,
 )
 from lagjax._equations._motion import Motion
-from lagjax._equations._patterns import sparse_jacobian
+from lagjax._equations._patterns import jacobian_pattern, sparse_jacobian
 from lagjax._equations._rank import Decided, decide, echelon_form, null_space, span_outside
+from lagjax._equations._saddle import SaddleElimination, elimination_order
 from lagjax._equations._scales import Scales
-from lagjax._equations._sparse import Diagonal, MatrixFree
+from lagjax._equations._sparse import Band, Blocks, Diagonal, MatrixFree, Sparse, form_of, refine
 from lagjax._equations._structure import SparseMotion

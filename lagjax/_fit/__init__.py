@@ -32,7 +32,7 @@ from lagjax._fit.model._records import Guess, Record, require_untraced
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals
 from lagjax._fit.model._sensors import Delayed, wrapped
 from lagjax._fit.model._timings import Timings
-from lagjax._fit.model._transforms import Smooth, angle, between, inertia, positive, simplex
+from lagjax._fit.model._transforms import Smooth, Unbounded, angle, between, inertia, positive, simplex
 from lagjax._fit.result._comparison import Comparison
 from lagjax._fit.result._evidence import begin_weakly, find_smoothness
 from lagjax._fit.result._experiments import Experiments
@@ -43,7 +43,8 @@ from lagjax._fit.result._report import draw_record
 from lagjax._fit.result._result import Fit
 from lagjax._fit.result._selection import Selection, keep_selected, select_terms
 from lagjax._fit.result._verdict import is_doubtful
-from lagjax._fit.search._multistart import run_multistart
+from lagjax._fit.search._descent import Descent
+from lagjax._fit.search._multistart import Waterfall, run_multistart
 from lagjax._fit.search._reader import TimeScales, first_starts, read_records, time_scales
 from lagjax._fit.search._search import Search, search_again
 from lagjax._fit.search._unexplained import Unexplained
@@ -56,7 +57,9 @@ _METHODS = ("auto", "segments", "whole", "gradient")
 # Free numbers from which on a sentence says that another method may be meant. Of a network of 337 a trial takes half a
 # minute, and the gradient's whole descent as long; scenes of 50 need no such advice.
 _MANY_UNKNOWNS = 100
-_MORE_STARTS = 16, 64  # of motion that sticks, or strikes, where one start leaves motion
+# Of motion that sticks, or strikes, where one start is not enough: 16 at a time, until they are. Of 12 guesses of a
+# block that sticks and slips, up to three times off, one start was enough for 1, 16 for 7, 48 for 3, and 64 for 1.
+_STARTS_AT_A_TIME, _TIMES = 16, 4
 
 
 @with_doubles
@@ -70,7 +73,7 @@ def fit(
     transforms: PyTree = None,
     noise: AbstractNoise | None = None,
     hold: str = "zero",
-    starts: int = 1,
+    starts: int | None = None,
     method: str = "auto",
     seed: int = 0,
     progress: bool = False,
@@ -108,13 +111,17 @@ def fit(
     - `starts`: the number of parameter values from which to search: `params0`, and random ones drawn with `seed`, about
       a positive number with a decade as standard deviation, uniform between bounds, on a circle or a simplex, and about
       any other number with its size as standard deviation. The best few go through the whole search, and `params0`
-      always does; `Fit.waterfall` tells where each of them ended. Where motions jump, by contacts or in a `Hybrid`, 16
-      and then 64 are tried if the search from `params0` leaves motion.
+      always does; `Fit.waterfall` tells where each of them ended. None is one start; where motions jump, by contacts or
+      in a `Hybrid`, up to 64 are added if the search from `params0` leaves motion, does not see all that is
+      free, or cannot follow the motion at all.
     - `progress`: print a line for every trial to stderr.
     - `method`: "whole" begins with whole records. "segments" begins with short segments of them, each with a start of
       its own read off the data, and joins these step by step; for that the signals must have the structure of q. "auto"
       does so where the signals allow it and the records are longer than the motion's time scale: then the search
-      converges for long and chaotic records, and from parameters that are far off. "gradient" descends by reverse-mode
+      converges for long and chaotic records, and from parameters that are far off. Where signals are no positions and
+      all starts are known, a search that leaves more than a twentieth of the signals is tried again from the first
+      samples of the records, and the likelier of both is taken. Of hundreds of records an even sample is searched
+      before all of them. "gradient" descends by reverse-mode
       gradients with optax's Adam: for scenes with neural terms, an `equinox.nn.MLP` in `params0` for instance. With
       more than a hundred free numbers the other methods say in a warning that this one is meant for them.
 
@@ -138,8 +145,8 @@ def fit(
     print(lagjax.fit(scene, record, {"k": 1.0}, transforms=lagjax.positive))
     ```
     """
-    if not (isinstance(starts, int | np.integer) and starts > 0):
-        raise ValueError(f"starts must be a positive whole number; got {starts!r}.")
+    if not (starts is None or (isinstance(starts, int | np.integer) and starts > 0)):
+        raise ValueError(f"starts must be a positive whole number, or None to let the fit choose; got {starts!r}.")
     if not (isinstance(seed, int | np.integer) and seed >= 0):
         raise ValueError(f"seed must be a whole number, 0 or larger; got {seed!r}.")
     if method not in _METHODS:
@@ -157,7 +164,7 @@ def fit(
         raise TypeError(f"noise must be lagjax.Gaussian(), StudentT(), Quantised(…) or Clipped(…); got {noise!r}.")
     given = read_systems(system, records, params0, observe, hold)
     build = functools.partial(Parameters.from_pytree, params0, free, transforms)
-    search = _FitSearch(params0, build, noise, int(starts), method, int(seed), progress)
+    search = _FitSearch(params0, build, noise, starts and int(starts), method, int(seed), progress)
     followed = build(sum(len(one.records) for one in given)).unknowns.columns.shape[1]
     if followed > _MANY_UNKNOWNS and method != "gradient":
         warnings.warn(
@@ -189,7 +196,7 @@ class _FitSearch(NamedTuple):
     params0: PyTree
     build: Callable[[int], Parameters]
     law: AbstractNoise
-    starts: int
+    starts: int | None  # None: one, and more where that is not enough
     method: str
     seed: int
     progress: bool
@@ -214,18 +221,7 @@ class _FitSearch(NamedTuple):
         if self.method == "gradient":
             descent = search.descend_gradient(point)
         else:
-            descent, waterfall = run_multistart(residuals, search, point, self.starts, self.seed)
-            may = (
-                looks_further
-                and self.starts == 1
-                and len(residuals.parameters)
-                and not any(p.clocks for p in residuals.parts)
-            )
-            for starts in _MORE_STARTS if may and any(jumps(part.scene) for part in residuals.parts) else ():
-                if not is_doubtful(descent):
-                    break
-                other, waterfall = run_multistart(residuals, search, descent.trial.point, starts, self.seed)
-                descent = max(descent, other, key=lambda one: one.residuals.log_likelihood(one.trial, one.noise))
+            descent, waterfall = self._descend(residuals, search, point, looks_further)
             descent = search_again(descent, self.law)
         residuals.watch = descent.residuals.watch = None
         descent = find_smoothness(descent, self.law, _print_line if self.progress else None)
@@ -235,22 +231,50 @@ class _FitSearch(NamedTuple):
             descent, selection = select_terms(descent, self.law, laws, tell)
         return Fit.from_descent(descent, self.law, waterfall, selection)
 
+    def _descend(
+        self, residuals: Residuals, search: Search, point: Point, looks_further: bool
+    ) -> tuple[Descent, Waterfall | None]:
+        """The end of the search from the starts that were asked for; where that is left to it, from one, and from more
+        if that one is not enough. Raises `LostMotion` where none can be followed."""
+        tell, lost, chooses = _print_line if self.progress else None, None, looks_further and self.starts is None
+        chooses &= len(residuals.parameters) > 0 and any(jumps(part.scene) for part in residuals.parts)
+        done, misfits = None, np.zeros(0)
+        try:
+            done, waterfall = run_multistart(residuals, search, point, self.starts or 1, self.seed, tell)
+            if not chooses:
+                return done, waterfall
+        except LostMotion as reason:
+            if not chooses:
+                raise
+            lost = reason
+        while len(misfits) < _TIMES * _STARTS_AT_A_TIME and (done is None or is_doubtful(done)):
+            if tell:
+                tell(f"One start is not enough, others are tried: {lost or 'the motion may be another one.'}")
+            begin, seed = point if done is None else done.trial.point, [self.seed, len(misfits)]
+            try:
+                other, some = run_multistart(residuals, search, begin, _STARTS_AT_A_TIME, seed, tell)
+            except LostMotion:
+                text = f"{lost} Nor could the motions from {_STARTS_AT_A_TIME - 1} other starts be followed."
+                raise LostMotion(text) from None
+            assert some is not None
+            misfits = np.sort(np.append(misfits, some.misfits))
+            both = [one for one in (done, other) if one is not None]
+            done = max(both, key=lambda one: one.residuals.log_likelihood(one.trial, one.noise))
+        assert done is not None
+        if lost:
+            text = "The motion with params0 could not be followed: this is the best search from other starts."
+            done = done._replace(message=f"{done.message} {text}")
+        return done, Waterfall(misfits) if len(misfits) else None
+
     def _require_one_beginning(self, residuals: Residuals) -> None:
-        if not len(residuals.parameters) and (self.method == "gradient" or self.starts > 1):
+        several = self.starts is not None and self.starts > 1
+        if not len(residuals.parameters) and (self.method == "gradient" or several):
             raise ValueError(
                 "No parameter is free, so there is one place to begin: leave `starts` at 1, and `method` at 'auto', "
                 "which fits the starts of records."
             )
-        if self.method == "gradient" and self.starts > 1:
+        if self.method == "gradient" and several:
             raise ValueError('method="gradient" goes down from one start: leave `starts` at 1.')
-        for part in residuals.parts if self.starts > 1 else []:
-            why = (
-                "sensors are lagjax.Delayed" if part.signals.delays is not None
-                else "starts on constraints are fitted" if part.fits_on_constraints
-                else "there are lagjax.Timings" if part.clocks else None
-            )  # fmt: skip
-            if why is not None:
-                raise ValueError(f"starts must be 1 where {why}: their search has one beginning.")
 
     def find_mistake(self, given: list[GivenSystem], left: Unexplained, spent: float) -> list[str]:
         """The first mistake in records that explains a poor fit, as a sentence; `spent` is the fit's processor time."""

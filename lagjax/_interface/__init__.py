@@ -1,10 +1,10 @@
-"""The border to the user's world: functions as they are called and read, numbers as they come and go, results.
+"""The interface to the user: how functions are called and read, how numbers are checked, and how results are reported.
 
-`_arguments` calls functions of the user: roles by position, `t` and `params` by name; `reads/` says what such a
-function reads, and whether that is still the same. `_layout` turns a pytree into a flat vector and back, and names
-coordinates. `_validate` holds what can be wrong with numbers, and the sentences for it; `_results` the result codes,
-what to try, and the exception; `_platform` the kind of device that JAX computes on, and the numbers of arrays on it.
-`_registered` is how a room calls a function of a room above, `_version` the version of the package.
+`_arguments` calls functions of the user: state by position, `t` and `params` by name; `reads/` finds the values that
+such a function reads, and detects that one has changed. `_layout` turns a pytree into a flat vector and back, and names
+coordinates. `_validate` checks numbers, with a message for each mistake; `_results` has the result codes, advice, and
+the exception; `_platform` the kind of device that JAX computes on, and the numbers of arrays on it. `_registered` is
+how a room calls a function of a room above it, `_version` the version of the package.
 """
 
 from lagjax._interface._arguments import (

@@ -31,11 +31,10 @@ _BY_NAME = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_O
 
 
 class Function(eqx.Module):
-    """A user's function together with the extras it asks for; called with all of them.
+    """A user's function and the optional arguments (`extras`) in its signature; callers pass all extras.
 
-    The function is part of the program, in the edition of what it read (`reads.Edition`); its arrays (the weights of a
-    neural Lagrangian) are data: they are separate fields, so that a scene is a valid argument and result of every JAX
-    transformation.
+    It is split into its arrays, such as the weights of a neural Lagrangian, and the rest: `code` with what it reads
+    (`reads.Edition`). The arrays are leaves, so that a scene can be an argument and a result of JAX transformations.
     """
 
     arrays: Any
@@ -44,14 +43,14 @@ class Function(eqx.Module):
 
     @property
     def name(self) -> str:
-        """The name that the user's function was defined with, or that of its class."""
+        """The `__name__` of the user's function, or of its class."""
         code = self.code.function
         while isinstance(code, functools.partial):
             code = code.func
         return getattr(code, "__name__", type(code).__name__)
 
     def __call__(self, *roles: Any, **extras: Any) -> Any:
-        """The function's result for the roles, by position, and for those of the extras that it asks for, by name."""
+        """Call the function with the roles, by position, and with those of the extras that its signature has."""
         function = eqx.combine(self.arrays, self.code.function)
         if "inputs" in self.extras and "inputs" not in extras:
             raise TypeError(
@@ -86,14 +85,14 @@ class Function(eqx.Module):
 
 # A function, as to call a method of an equinox.Module takes as long as half a motion.
 def present(function: Function) -> Function:
-    """A function in its present edition: this one, where nothing that it reads has changed."""
+    """Return the function with the current `Edition` of its code; the same object if nothing it reads has changed."""
     fields = object.__getattribute__(function, "__dict__")
     code = fields["code"].now()
     return function if code is fields["code"] else Function(fields["arrays"], code, fields["extras"])
 
 
 class ValueNotKnown(TypeError):
-    """A function of the user asked a number for its value while it was being traced."""
+    """Raised where a user's function needs the value of a traced number, as in `if q > 0`."""
 
 
 # Errors of JAX where that happens; they are TypeErrors, too.
@@ -123,13 +122,13 @@ def _dict_keys(roles: tuple, extras: dict[str, Any]) -> str:
 
 
 def find_params_expression(reason: Exception) -> str | None:
-    """The expression that read `params` where a function of the user failed; None where something else failed."""
+    """Return the expression in the failing line of a user's function if it begins with `params`, else None."""
     _, text = _failing_expression(reason)
     return text if text.startswith(("params", "(params")) else None
 
 
 def _failing_expression(reason: Exception) -> tuple[str, str]:
-    """The line of the user that failed, and its expression; empty where these are not known."""
+    """Return (file and line, expression) of the user's code that raised `reason`; empty strings if not known."""
     frames = traceback.extract_tb(reason.__traceback__)
     theirs = [frame for frame in frames if not frame.filename.startswith(_NOT_USERS)]
     if not theirs or theirs[-1].lineno is None:
@@ -140,7 +139,7 @@ def _failing_expression(reason: Exception) -> tuple[str, str]:
 
 
 def _add_note(error: Exception, name: str, text: str) -> None:
-    """Say beneath an error of Python or JAX which function of the scene it came from, and what that means."""
+    """Add a note to an error of Python or JAX: which function of the scene it came from, and what that means."""
     if not any(_OF_A_SCENE in note for note in getattr(error, "__notes__", ())):
         error.add_note(f"This is {name}, {_OF_A_SCENE}: {text}")
 
@@ -148,11 +147,11 @@ def _add_note(error: Exception, name: str, text: str) -> None:
 def accept(
     function: Callable, role: str, roles: tuple[str, ...] = ("q", "qdot"), extras: tuple[str, ...] = ("t", "params")
 ) -> Function:
-    """Check that `function` has the signature of its `role` in a scene; the result passes the extras it asks for.
+    """Check that `function` has the signature of its `role` in a scene; return it as a `Function`.
 
     Raises `TypeError` when it is not callable, when its leading positional parameters are not the `roles`, or when it
-    asks by name for anything that is not among the `extras`. Keywords bound with `functools.partial` are left alone,
-    and so are those with a default, as `m` in `lambda q, v, m=2.0: …`, unless they look like one of the extras.
+    has required parameters other than the `extras`. Keywords bound with `functools.partial` are left alone, and so are
+    those with a default, as `m` in `lambda q, v, m=2.0: …`, unless they look like one of the extras.
     """
     *others, last = (f"`{extra}`" for extra in extras)
     by_name = f"{', '.join(others)} and {last}" if others else last
@@ -185,7 +184,7 @@ def accept(
 
 
 def restrict_signature(function: Callable, extras: set[str], roles: int = 2) -> Callable:
-    """`function(*roles, t, params)` with a signature that shows only `extras`: without `t` it is autonomous."""
+    """Wrap `function(*roles, t, params)` in a signature with only these `extras`: without `t` it is autonomous."""
 
     def restricted(*state, t=0.0, params=None, **more):
         return function(*state, t, params, **more)
@@ -197,12 +196,12 @@ def restrict_signature(function: Callable, extras: set[str], roles: int = 2) -> 
 
 
 def _resembles_extra(name: str, extras: tuple[str, ...]) -> bool:
-    """True if a name is a likely misspelling of one of the extras, whose default would then be a silent mistake."""
+    """True if a name is probably a misspelling of one of the extras: its default would then be used silently."""
     known = [*extras, *(["time"] if "t" in extras else [])]
     return bool(difflib.get_close_matches(name.lower(), known, cutoff=0.7))
 
 
 def _parameter_text(parameter: inspect.Parameter) -> inspect.Parameter:
-    """A parameter as a sentence shows it: without a default that would fill the screen."""
+    """Return a parameter as an error message shows it: without its default if that is long."""
     short = len(str(parameter)) <= _SHOWN
     return parameter if short else parameter.replace(default=parameter.empty, annotation=parameter.empty)

@@ -1,7 +1,7 @@
-"""The two doors between the user's pytree of coordinates and the flat vector that everything inside works on.
+"""`Layout`: conversion between the user's pytree of coordinates and the flat vector that is used inside the package.
 
 A `Layout` is read off one state (q, qdot): the tree, the shape of every leaf, one floating dtype, and a name for each
-scalar coordinate, such as `q['theta']` or `q.r` or `q[1]`, by which error messages call it.
+scalar coordinate, such as `q['theta']` or `q.r` or `q[1]`, for error messages.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ from lagjax._interface._results import join_names
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Layout:
-    """The structure of a state's coordinates: `flatten` makes a vector of them, `restore` undoes it."""
+    """The structure of a state's coordinates: `flatten` turns a pytree into a vector, `restore` turns it back."""
 
     tree: Any
     shapes: tuple[tuple[int, ...], ...]
@@ -31,9 +31,9 @@ class Layout:
 
     @classmethod
     def from_state(cls, q: PyTree, qdot: PyTree, name: str = "qdot") -> "Layout":
-        """Read the layout of a state; raise `TypeError` or `ValueError`, with a sentence, where (q, qdot) is none.
+        """Read the layout off a state; raise `TypeError` or `ValueError` if q and qdot do not fit together.
 
-        The rates of q that are given in the place of q̇ have another `name`.
+        `name` is what messages call the second pytree.
         """
         paths, tree, shapes, dtypes = _checked_structure(q, "q")
         _, qdot_tree, qdot_shapes, qdot_dtypes = _checked_structure(qdot, name)
@@ -53,7 +53,7 @@ class Layout:
 
     @classmethod
     def from_numbers(cls, tree: PyTree, name: str, dtype) -> "Layout":
-        """The layout of any pytree of real floats; `TypeError`, with the `name` of the leaf, for anything else."""
+        """Return the layout of any pytree of real floats; raise `TypeError` for other leaves, under `name`."""
         paths, structure, shapes, _ = _checked_structure(tree, name)
         return cls(structure, shapes, paths, np.dtype(dtype))
 
@@ -71,7 +71,7 @@ class Layout:
         )
 
     def flatten(self, tree: PyTree) -> Float[Array, " n"]:
-        """The leaves of one state's q or qdot end to end, n = `size`."""
+        """Concatenate the leaves of one state's q or qdot to a vector (n,)."""
         leaves = jax.tree.leaves(tree)
         if not any(isinstance(leaf, jax.Array) for leaf in leaves):  # one transfer instead of some operations
             return jnp.asarray(np.concatenate([np.ravel(np.asarray(leaf, self.dtype)) for leaf in leaves]))
@@ -79,7 +79,7 @@ class Layout:
         return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)
 
     def restore(self, flat: Float[Array, "... n"] | np.ndarray) -> PyTree:
-        """The user's pytree of one vector (n,), or of many: leaves of shape (..., *the shape of the leaf)."""
+        """Split a vector (n,), or many (..., n), into the user's pytree: leaves (..., *the shape of the leaf)."""
         leaves, begin = [], 0
         for shape in self.shapes:
             end = begin + math.prod(shape)
@@ -89,20 +89,20 @@ class Layout:
 
 
 def halves(y):
-    """(q, q̇), each (…, n), of states (…, 2n)."""
+    """Split states y (…, 2n) into (q, q̇), each (…, n)."""
     n = y.shape[-1] // 2
     return y[..., :n], y[..., n:]
 
 
 @functools.partial(jax.jit, static_argnums=1, inline=True)  # outside of `jit` one program
 def flatten_numbers(numbers: PyTree, dtype) -> Float[Array, " P"]:
-    """All numbers of a pytree end to end, in the order of its leaves."""
+    """Concatenate all numbers of a pytree, in the order of its leaves, to (P,)."""
     leaves = [jnp.ravel(jnp.asarray(leaf)).astype(dtype) for leaf in jax.tree.leaves(numbers)]
     return jnp.concatenate(leaves) if leaves else jnp.zeros(0, dtype)
 
 
 def _checked_structure(tree: PyTree, name: str) -> tuple[tuple[str, ...], Any, tuple[tuple[int, ...], ...], list]:
-    """The paths, the tree, the shapes and the dtypes of a pytree, whose leaves are checked to hold real floats."""
+    """Return the paths, the tree, the shapes and the dtypes of a pytree; raise if a leaf is no real float."""
     paths, leaves, structure = labelled_leaves(tree, name)
     dtypes = []
     for path, leaf in zip(paths, leaves, strict=True):
@@ -124,7 +124,7 @@ _DOUBLE = np.dtype("float64")
 
 
 def dtype_of(x):
-    """The dtype that JAX computes with for a number or an array. Raises `TypeError` or `ValueError` without one."""
+    """Return the dtype that JAX computes with for a number or an array; raise `TypeError` or `ValueError` if none."""
     # An array of JAX has it already, and tells at a tenth of what `jnp.result_type` costs; a weak one does not. One of
     # NumPy in double precision has it where JAX has doubles.
     if isinstance(x, jax.Array) and not getattr(x, "weak_type", True):  # arrays of random keys have no such attribute
@@ -135,7 +135,7 @@ def dtype_of(x):
 
 
 def describe_numbers(tree: PyTree, name: str) -> str:
-    """The numbers of a pytree by name, "q['x'] = 1, q['y'] = 2": the first of them."""
+    """Return the first numbers of a pytree by name, as text: "q['x'] = 1, q['y'] = 2"."""
     found = [
         f"{label}{list(place) if place else ''} = {value:.6g}"
         for label, leaf in zip(*labelled_leaves(tree, name)[:2], strict=True)
@@ -145,14 +145,14 @@ def describe_numbers(tree: PyTree, name: str) -> str:
 
 
 def number_names(tree: PyTree, name: str) -> list[str]:
-    """A name for each number in a pytree, such as params['m'][0], in the order of its leaves."""
+    """Return a name for each number in a pytree, such as params['m'][0], in the order of its leaves."""
     labels, leaves, _ = labelled_leaves(tree, name)
     shapes = [(label, np.shape(leaf)) for label, leaf in zip(labels, leaves, strict=True) if eqx.is_array_like(leaf)]
     return [label + str(list(at)) * bool(shape) for label, shape in shapes for at in np.ndindex(shape)]
 
 
 def labelled_leaves(tree: PyTree, name: str, is_leaf=None) -> tuple[tuple[str, ...], list, Any]:
-    """The leaves of a pytree with their names, such as `params['m']`, and its structure."""
+    """Return the names of a pytree's leaves, such as `params['m']`, the leaves, and the tree structure."""
     try:
         leaves, structure = jax.tree_util.tree_flatten_with_path(tree, is_leaf)
     except ValueError as why:  # a dict whose keys have no order

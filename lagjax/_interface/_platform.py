@@ -1,4 +1,4 @@
-"""The device: its kind, as far as a traced program can know it, and the numbers of the arrays that it holds."""
+"""The device that JAX computes on: its kind, options of XLA's compilation, and reading numbers from arrays."""
 
 import functools
 from collections.abc import Callable
@@ -34,7 +34,7 @@ def has_nvidia_gpu() -> bool:
 
 @functools.cache
 def _unoptimised_options() -> dict[str, Any]:
-    """The options of XLA without optimisation, as far as this version of it has them."""
+    """Return compiler options that switch XLA's optimisation off, as far as this version of XLA accepts them."""
     # Compilation of the algebra around a few matrices takes half of the time so, and runs as fast to a millisecond.
     options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
     try:
@@ -45,7 +45,7 @@ def _unoptimised_options() -> dict[str, Any]:
 
 
 def compile_for_one_call(function: Callable) -> Callable:
-    """A function that XLA compiles without optimisation where it is called with numbers: what runs once, or seldom."""
+    """Wrap a function that runs rarely: called with numbers, it is compiled without optimisation, which is faster."""
     # Within what is traced already, which may run often, it is optimised as all else there. `jax.jvp` and `jax.jacfwd`
     # call it with numbers; reverse mode traces what it pulls back, which takes no options.
     optimised = eqx.filter_jit(function)
@@ -69,7 +69,7 @@ def _primal_of(x: Any) -> Any:
 
 
 def compiled_once(function: Callable) -> Callable:
-    """The jitted function, whose calls XLA does not inline on CPUs, in whose body it inlines all."""
+    """Jit a function such that XLA on a CPU compiles it once and calls it, instead of inlining it at every call."""
     # On a GPU a call of its own costs as much as the arithmetic of a step, and compiling ten of them is quick.
 
     @jax.jit
@@ -85,7 +85,7 @@ def compiled_once(function: Callable) -> Callable:
 
 
 def is_known(x: Any) -> bool:
-    """True if the values of an array can be read here: it is neither traced, nor a shape alone, nor deleted."""
+    """True if the values of an array can be read now: it is no tracer, no `ShapeDtypeStruct`, and not deleted."""
     if isinstance(x, Tracer):
         return False
     if isinstance(x, jax.Array):
@@ -94,6 +94,6 @@ def is_known(x: Any) -> bool:
 
 
 def numbers_at(array, place: tuple) -> np.ndarray:
-    """`array[place]` in NumPy; of an array on another device only that much is copied from there."""
+    """Return `array[place]` in NumPy; from another device only this part is copied."""
     elsewhere = isinstance(array, jax.Array) and any(device.platform != "cpu" for device in array.devices())
     return np.asarray(array[place] if elsewhere else np.asarray(array)[place])

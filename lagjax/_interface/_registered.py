@@ -1,6 +1,6 @@
-"""Functions of rooms above that a trajectory or a scene calls: it shows itself, its failure is explained.
+"""Functions of rooms above that a trajectory or a scene calls, such as those for display and explanation of a failure.
 
-No room imports from above. `lagjax/__init__` stands above all of them and registers these functions; each imports its
+No room imports from a room above it. `lagjax/__init__`, above all of them, registers these functions; each imports its
 room when it is called.
 """
 
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 class Registered(NamedTuple):
     """The functions of rooms above that a scene, a trajectory or one of its tables calls.
 
-    A dataset and a frame take the `units` and the `time_unit` of `to_xarray`.
+    `dataset` and `frame` take the `units` and the `time_unit` of `to_xarray`.
     """
 
     summary: Callable[[Any], str]

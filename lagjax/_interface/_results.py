@@ -1,4 +1,4 @@
-"""The outcomes of a trajectory in words: result codes, what to try, the exception that carries one, and lists of names.
+"""The outcomes of a trajectory: result codes, their messages and advice, and the exception `SimulationError`.
 
 The codes are those of diffrax, by the same names and numbers, and ours. They travel inside `jit` and `vmap` as arrays,
 one per member of a batch; only `simulate` turns one into an exception.
@@ -25,7 +25,7 @@ PUSHED = (
 
 class _WordedEnum(type(eqx.Enumeration)):
     def __getitem__(cls, item) -> str:
-        """The sentence of one result, or its name where it has none; of many, how many there are by name."""
+        """Return the message of a result, or its name if it has none; of an array of results, counts by name."""
         code = item._value
         if isinstance(code, Tracer) or not isinstance(code, np.ndarray | jax.Array):
             return super().__getitem__(item)
@@ -162,12 +162,12 @@ _NAMES = {int(item._value): name for name, item in RESULTS._name_to_item.items()
 
 
 def name_of(code) -> str:
-    """The name of a result code, an integer: 'nonfinite_state', as in `lagjax.RESULTS`."""
+    """Return the name of a result code, an integer: 'nonfinite_state', as in `lagjax.RESULTS`."""
     return _NAMES[int(code)]
 
 
 def advice(result: RESULTS, is_implicit: bool = False) -> str:
-    """The sentence for one concrete result, of a solver that may be implicit: what happened, and what to try."""
+    """Return the message for one concrete result, with advice that depends on whether the solver is implicit."""
     if result == RESULTS.dt_min_reached:
         return (
             "The step size shrank to nothing. The motion runs into a singularity or a discontinuity there (a "
@@ -193,7 +193,7 @@ class SimulationError(RuntimeError):
 
 
 def show_str(result, printer, cycle: bool) -> None:
-    """Let IPython show the `str` of a result, which is meant for reading: the `_repr_pretty_` of its class."""
+    """Print `str(result)` in IPython: the `_repr_pretty_` of result classes."""
     try:
         text = str(result)
     except Exception:  # a display must not fail, as where `str` has no values to show inside `jax.jit`
@@ -202,5 +202,5 @@ def show_str(result, printer, cycle: bool) -> None:
 
 
 def join_names(names: Sequence[str], longest: int = 8) -> str:
-    """Names separated by commas, the `longest` first of them and how many more."""
+    """Return names separated by commas: the first `longest` of them, and how many more there are."""
     return ", ".join(names[:longest]) + (f" and {len(names) - longest} more" if len(names) > longest else "")

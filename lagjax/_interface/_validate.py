@@ -1,7 +1,7 @@
-"""The checks of a user's numbers, before any work is done, with a sentence for each mistake.
+"""Checks of the numbers that a user passes, with a message for each mistake.
 
-Numbers become arrays, so that a new value is never a new program. Values that are being traced (inside the user's own
-`jit`) have no number yet: for them only shapes and dtypes are checked.
+Numbers become arrays, so that a new value needs no new compilation. Of values that are being traced, inside the user's
+own `jit`, only shapes and dtypes are checked.
 """
 
 from typing import Any
@@ -17,7 +17,7 @@ from lagjax._interface._layout import dtype_of, labelled_leaves
 
 
 def as_arrays(tree: PyTree, dtype, name: str = "params") -> PyTree:
-    """Every number as an array, so that a new value is no new program; floats in the dtype of the state."""
+    """Return the tree with numbers as arrays, so that new values need no new compilation; floats get `dtype`."""
     # Raises `TypeError` or `ValueError`, with the name of the leaf, for what is neither a number nor can be a part of
     # the program.
     try:
@@ -31,7 +31,7 @@ def as_arrays(tree: PyTree, dtype, name: str = "params") -> PyTree:
 
 
 def _is_valid_leaf(leaf, dtype) -> bool:
-    """True if nothing can be wrong with a leaf: a Python float, or an array that has the dtype of the state."""
+    """True if a leaf needs no check: a Python float, or an array with the dtype of the state."""
     if type(leaf) is float:
         return dtype != _SINGLE or _TINY <= abs(leaf) <= _HUGE or leaf == 0
     return (type(leaf) is np.ndarray or isinstance(leaf, jax.Array)) and leaf.dtype == dtype
@@ -58,7 +58,7 @@ def _leaf_as_array(leaf, label: str, dtype):
 
 
 def _require_float32_range(leaf, label: str) -> None:
-    """Raise `ValueError` where float32 is too narrow for the largest number of a leaf."""
+    """Raise `ValueError` if the largest number of a leaf is out of the range of float32."""
     largest = float(np.max(np.abs(np.asarray(leaf, float)), initial=0.0)) if is_concrete(leaf) else 0.0
     if largest and np.isfinite(largest) and not _TINY <= largest <= _HUGE and getattr(leaf, "dtype", None) != _SINGLE:
         raise ValueError(
@@ -71,7 +71,7 @@ _SINGLE, _TINY, _HUGE = np.dtype("float32"), float(np.finfo(np.float32).tiny), f
 
 
 def _dtype_of(value):
-    """The dtype of a number or an array of numbers; None for all else, of which NumPy has many kinds."""
+    """Return the dtype of a number or an array of numbers; None for anything else."""
     try:
         kind = dtype_of(value)
     except (TypeError, ValueError):
@@ -80,7 +80,7 @@ def _dtype_of(value):
 
 
 def require_numbers(leaf, label: str) -> None:
-    """Raise `TypeError` for a leaf that is not a number or an array of numbers, of a kind that JAX knows."""
+    """Raise `TypeError` if a leaf is not a number or an array of numbers of a dtype that JAX has."""
     if _dtype_of(leaf) is None:
         kind = getattr(leaf, "dtype", None)
         got = type(leaf).__name__ if kind is None else f"an array of {kind}"
@@ -88,7 +88,7 @@ def require_numbers(leaf, label: str) -> None:
 
 
 def _as_array(x, dtype=None):
-    """An array of JAX if it is one already, else one of NumPy, which costs nothing and stays a number inside `jit`."""
+    """Return an array of JAX as it is, else one of NumPy, which is cheap and stays concrete inside `jit`."""
     if isinstance(x, jax.Array):
         return x if dtype is None or x.dtype == dtype else x.astype(dtype)
     return np.asarray(x, jnp.result_type(x) if dtype is None else dtype)
@@ -99,13 +99,13 @@ def is_concrete(value) -> bool:
 
 
 def require_concrete(tree: PyTree, what: str, instead: str) -> None:
-    """Raise `TypeError` where a number of `what` is being traced; `instead` is a sentence about what to do."""
+    """Raise `TypeError` if a number of `what` is being traced; `instead` is the advice in the message."""
     if not all(map(is_concrete, jax.tree.leaves(tree))):
         raise TypeError(f"{what} is being traced by jax.jit, jax.vmap or jax.grad. {instead}")
 
 
 def not_finite(tree: PyTree, name: str) -> list[tuple[str, Any]]:
-    """Every number that is NaN or infinite, with its name; values that are being traced have none yet."""
+    """Return (name, value) of every number that is NaN or infinite; traced numbers are not checked."""
     if all(_is_finite(leaf) for leaf in jax.tree.leaves(tree)):  # the names of leaves cost more than all else
         return []
     found = []
@@ -118,7 +118,7 @@ def not_finite(tree: PyTree, name: str) -> list[tuple[str, Any]]:
 
 
 def _is_finite(leaf) -> bool:
-    """True if a leaf is an array of floats without NaN and infinity; false where that takes a closer look."""
+    """True if a leaf is a concrete float array without NaN and infinity; False also where this needs a slower check."""
     return isinstance(leaf, np.ndarray | jax.Array) and is_concrete(leaf) and leaf.dtype in _FLOATS and all_finite(leaf)
 
 
@@ -130,7 +130,7 @@ def all_finite(array) -> bool:
 
 
 def require_budget(value, name: str) -> None:
-    """Raise for what is no positive integer of 32 bits, in which steps and transitions are counted."""
+    """Raise `ValueError` if a maximum number, of steps for example, is no positive integer of 32 bits."""
     if isinstance(value, bool) or not isinstance(value, int) or value < 1:
         raise ValueError(f"{name} must be a positive integer, so that every run ends; got {value!r}.")
     if value >= 2**31:
@@ -159,16 +159,16 @@ def require_number(value, name: str) -> None:
 
 
 def _suggest_params(value) -> str:
-    """A sentence about parameters that stand in the place of a number or of times; nothing for anything else."""
+    """Return advice for the message if `value` looks like params passed in another argument's place; else ""."""
     if not isinstance(value, dict | list | tuple | eqx.Module):
         return ""
     return " Parameters come behind it; or name them, params=…."
 
 
 def output_times(ts, dtype, rows: bool = False) -> jax.Array | np.ndarray:
-    """The output times as an array (T,) of this dtype; with `rows` also (N, T), a row for each of N members.
+    """Return the output times as an array (T,) of this dtype; with `rows` also (N, T), a row for each of N members.
 
-    Raises for what is not strictly monotonic, or not two times.
+    Raises if they are not strictly monotonic, or fewer than two.
     """
     known = isinstance(ts, np.ndarray | jax.Array) and _is_valid_leaf(ts, dtype) and is_concrete(ts)
     if known and (ts.ndim == 1 or (rows and ts.ndim == 2)):
@@ -216,7 +216,7 @@ def _is_monotonic(values: np.ndarray) -> bool:
 
 
 def require_tolerance(value, name: str):
-    """The value of `rtol` or `atol`. Raises where it is not one positive number, or an rtol that is 1 or more."""
+    """Return the value of `rtol` or `atol`; raise if it is not one positive number, or an rtol ≥ 1."""
     require_number(value, name)
     if is_concrete(value) and not (np.isfinite(value) and value > 0):
         raise ValueError(f"{name} must be positive; got {value}.")

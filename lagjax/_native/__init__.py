@@ -38,10 +38,10 @@ from lagjax._native.motions import _gpu as gpu
 from lagjax._native.motions._c_lines import CNumbers, write_function
 from lagjax._native.motions._derivative_handler import derivative_handler
 from lagjax._native.motions._handler import Plan, handler, make_once, unavailable
-from lagjax._native.motions._kernel import Begun, Kernel, Steps, cores, floor_of
+from lagjax._native.motions._kernel import Kernel, RunResults, Steps, cores, small_size
 from lagjax._native.motions._line_handler import LineCode, compilation_work, line_function, line_handler
 from lagjax._native.series._guards import Guards, append_guards
 from lagjax._native.series._motion_parts import Projection, pieces_of, recurrences
-from lagjax._native.series._taylor import is_large, order_for
+from lagjax._native.series._taylor import choose_order, is_large
 from lagjax._native.steps._watch import Crossed
 from lagjax._program import Nesting

@@ -43,7 +43,7 @@ from lagjax._program._levels import CLOCK, CONE, FLOOR, SIGN, SLIDE, TABLE, TRUN
 from lagjax._program._line import StraightLine
 from lagjax._program._look_ups import BESIDE, Located, Table, shift_look_up, table_of
 from lagjax._program._memory import lack_of_memory, machine_memory, operations_that_fit
-from lagjax._program._operations import LOOK_UPS, OPERATIONS
+from lagjax._program._operations import LOOK_UPS, OPERATIONS, Operation
 from lagjax._program._passes import count_uses, eliminate_dead_code, factor, sink_negations
 from lagjax._program._rounding import operation_error, rounding
 from lagjax._program._series import LinearSystem, Recurrent, Series, series

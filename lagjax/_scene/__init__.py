@@ -7,10 +7,17 @@ while they are traced.
 """
 
 from lagjax._scene._closed_over import lift_batch, lift_problem
-from lagjax._scene._contacts import Contacts, ContactScene, Flat, InContact, Shapes
-from lagjax._scene._driven import Driven, asking_for_inputs, drive_function, drive_scene, held_inputs, push_by_inputs
+from lagjax._scene._contacts import ContactParams, Contacts, ContactScene, ContactShapes, FlatContacts
+from lagjax._scene._driven import (
+    DrivenParams,
+    add_input_forces,
+    constant_inputs,
+    drive_function,
+    drive_scene,
+    roles_with_inputs,
+)
 from lagjax._scene._explanation import Explanation
-from lagjax._scene._samples import HOLDS, MARGINS, continued, samples, unevenly_spaced
+from lagjax._scene._samples import HOLDS, MARGINS, append_samples, samples, unevenly_spaced
 from lagjax._scene._system import (
     ARGUMENTS,
     ROLES,

@@ -1,8 +1,8 @@
-"""`lift_problem`: a problem whose functions close over numbers that are being traced, with these as parameters.
+"""`lift_problem`: replace the tracers that a problem's functions close over by parameters of the problem.
 
-`jax.grad(lambda k: simulate(System(lambda q, v: … k …), …))` gives a Lagrangian that reads a tracer. No program can be
-made of that, nor kept. So each function is traced once, as `jax.closure_convert` does, what it took from outside goes
-beside the user's parameters (`Lifted`), and the program serves every other value, and every function with that code.
+`jax.grad(lambda k: simulate(System(lambda q, v: … k …), …))` gives a Lagrangian that reads a tracer, which cannot be
+compiled or cached. So each function is traced once, as `jax.closure_convert` does, and the tracers become parameters
+beside the user's: the compiled program then serves every value of k, and every function with that code.
 """
 
 import dataclasses
@@ -22,8 +22,8 @@ from lagjax._interface.reads import Edition, place_in
 from lagjax._scene._system import ARGUMENTS, ROLES, replace_functions
 
 
-class Lifted(NamedTuple):
-    """The parameters of the user, and numbers that functions closed over, or by which modes differ."""
+class LiftedParams(NamedTuple):
+    """Parameters (params of the user, values): values are numbers that functions close over or modes differ by."""
 
     params: PyTree
     values: tuple
@@ -31,7 +31,7 @@ class Lifted(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _FunctionTrace:
-    """A function of the user as it was traced, for parameters that are `Lifted`."""
+    """A callable made of the jaxpr of a user's function; it takes `LiftedParams` in place of the user's."""
 
     name: str
     jaxpr: Any  # whose first arguments are the constants
@@ -43,7 +43,7 @@ class _FunctionTrace:
     def __name__(self) -> str:
         return self.name
 
-    def __call__(self, *roles: Any, params: Lifted, t: Any = 0.0, **more: Any) -> PyTree:
+    def __call__(self, *roles: Any, params: LiftedParams, t: Any = 0.0, **more: Any) -> PyTree:
         pairs = zip(self.constants, self.places, strict=True)
         constants = [c if k is None else params.values[k] for c, k in pairs]
         values = *constants, *jax.tree.leaves((roles, t, eqx.filter(params.params, eqx.is_array_like), more))
@@ -52,8 +52,8 @@ class _FunctionTrace:
 
 
 @dataclass(frozen=True, eq=False)
-class Unchanged:
-    """A function of the user that reads no tracer, for parameters that are `Lifted`."""
+class WithoutTracers:
+    """A user's function that closes over no tracer; it takes `LiftedParams` in place of the user's."""
 
     function: Function
 
@@ -61,12 +61,12 @@ class Unchanged:
     def __name__(self) -> str:
         return self.function.name
 
-    def __call__(self, *roles: Any, params: Lifted, t: Any = 0.0, **more: Any) -> PyTree:
+    def __call__(self, *roles: Any, params: LiftedParams, t: Any = 0.0, **more: Any) -> PyTree:
         return self.function(*roles, t=t, params=params.params, **more)
 
 
 def lift_problem(problem: Problem) -> Problem:
-    """The problem with the tracers that its functions close over as parameters; itself where they close over none."""
+    """Return the problem with `LiftedParams`, or `problem` itself if its functions close over no tracer."""
     fields = object.__getattribute__(problem.system, "__dict__")  # an attribute of an equinox.Module takes 2 µs
     present = [f for role in ROLES if isinstance(f := fields[role], Function)]
     if problem.event is not None:
@@ -87,22 +87,23 @@ def lift_problem(problem: Problem) -> Problem:
         event = event._replace(
             conditions=jax.tree.map(lift, event.conditions, is_leaf=lambda x: isinstance(x, Function))
         )
-    return dataclasses.replace(problem, system=system, event=event, params=Lifted(problem.params, tuple(values)))
+    return dataclasses.replace(problem, system=system, event=event, params=LiftedParams(problem.params, tuple(values)))
 
 
 def lift_batch(batch: Batch) -> Batch:
-    """A batch with the tracers that its functions close over as parameters of all members."""
+    """Do the same for a batch: the values become parameters with the same value in all members."""
     member = lift_problem(batch.member)
     if member is batch.member:
         return batch
     values = member.params.values
-    return Batch(member, batch.ts, batch.y0, Lifted(batch.params, values), (*batch.axes, *[None] * len(values)))
+    return Batch(member, batch.ts, batch.y0, LiftedParams(batch.params, values), (*batch.axes, *[None] * len(values)))
 
 
 def _lift_function(function: Function, roles: int, problem: Problem, values: list) -> Function:
+    """Trace a function of `roles` vectors and t; append the tracers that it closes over to `values`, in place."""
     extras = tuple(dict.fromkeys((*function.extras, "params")))
     if not function.code.tracers or "inputs" in function.extras:
-        return Function(None, Edition.from_function(Unchanged(function)), extras)
+        return Function(None, Edition.from_function(WithoutTracers(function)), extras)
     numbers, rest = eqx.partition(problem.params, eqx.is_array_like)
     layout = problem.layout
     state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)

@@ -1,11 +1,11 @@
-"""Contacts of a scene in flat coordinates: gaps and velocities that stay ≥ 0, their friction, and what is closed.
+"""The contacts of a scene in flat coordinates: gaps ≥ 0, one-way velocities ≥ 0, their friction, and their state.
 
-Which contacts are closed, and which of them stick, is data of one program (`InContact`): with g the gaps, γ the one-way
-velocities and s the slips,
+One compiled program serves all combinations of closed and sticking contacts: the combination is data (`ContactParams`).
+With gaps g, one-way velocities γ and slips s, the program has a row of the constraint matrix for each of
 
-    closed: g = 0, γ = 0       open: λ = 0       sticks: s = 0       slides: f = −μ λ c,  c the direction of s
+closed: g = 0, γ = 0 open: λ = 0 sticks: s = 0 slides: f = −μ λ c, c the direction of s
 
-are rows of one matrix, each held or released by a number.
+and a number, 1 or 0, that switches the row on or off.
 """
 
 import re
@@ -27,12 +27,12 @@ from lagjax._scene._system import System, name_numbers
 class Contacts(NamedTuple):
     """The state of k contacts, of which r have friction in d directions.
 
-    - `closed` (k,): 1 where the contact is closed, else 0; `sticks` (r,): 1 where it does not slide.
+    - `closed` (k,): 1 where the contact is closed, else 0; `sticks` (r,): 1 where it sticks, 0 where it slides.
     - `direction` (r, d): the direction of a slip that begins; in a plane its sign. In space its length is a velocity
       far below those of the motion, which is added to the slip: its direction is then defined at rest, too.
-    - `held`: 1 for each row that holds a contact, of gaps, one-way velocities and slips, (k + r d,), where these are
-      more than coordinates and so depend on each other; else (0,).
-    - `near` (): how near a corner of a gap counts as there (`_run.contacts._corners`).
+    - `held` (k + r d,): 1 for each row (gaps, one-way velocities, slips) that is in the constraint matrix. It is given
+      where there are more rows than coordinates, so that only independent rows may be taken; else (0,).
+    - `near` (): the distance below which a state counts as at a corner of a gap (`_run.contacts._corners`).
     """
 
     closed: Any
@@ -42,19 +42,19 @@ class Contacts(NamedTuple):
     near: Any
 
 
-class InContact(NamedTuple):
-    """The parameters of the user, and what the contacts do."""
+class ContactParams(NamedTuple):
+    """Parameters (params of the user, contacts): of a program that integrates a system with contacts."""
 
     params: PyTree
     contacts: Contacts
 
 
 class ContactScene(eqx.Module):
-    """A system with contacts, as machine code follows it: a scene whose parameters are `InContact`.
+    """A scene that takes `ContactParams`; its closed contacts are constraints, as machine code integrates it.
 
-    Where it `is_open` no contact is closed, whatever the parameters say: the motion of the system by itself. A body is
-    held by few independent rows, however many contacts it has: with `slots` there are this many rows, of gaps and of
-    velocities, which are those that `Contacts.held` chooses.
+    With `is_open` all contacts are taken as open, whatever the parameters say. With `slots` = (gaps, velocities) the
+    constraint matrix has only this many rows, which `Contacts.held` selects: a body is held by few independent rows,
+    however many contacts it has.
     """
 
     system: System
@@ -65,9 +65,12 @@ class ContactScene(eqx.Module):
     def path(self) -> str:
         return "array" if self.system.path == "array" else "scalar"  # arrays do not jump, however large the scene is
 
-    def _motion(self, layout: Layout, params: InContact) -> Motion:
-        """The motion while the contacts are as `params` say."""
-        free, flat = self.system._motion(layout, params.params), Flat.from_system(self.system, layout, params.params)
+    def _motion(self, layout: Layout, params: ContactParams) -> Motion:
+        """Return the equations of motion with the contacts in the state `params.contacts`."""
+        free, flat = (
+            self.system._motion(layout, params.params),
+            FlatContacts.from_system(self.system, layout, params.params),
+        )
         own = free.constraints
 
         def ask_user(function: Callable | None):
@@ -92,8 +95,8 @@ class ContactScene(eqx.Module):
 
         return couple_forces(motion, law, layout, params)
 
-    def _hold_contacts(self, own: Constraints, flat: "Flat", layout: Layout) -> Constraints:
-        """The constraints of the system with the rows that hold its contacts behind them, and their friction."""
+    def _hold_contacts(self, own: Constraints, flat: "FlatContacts", layout: Layout) -> Constraints:
+        """Return the system's own constraints, followed by the rows of the contacts, with the friction forces."""
 
         def held_positions(q, t, p):
             gaps = flat.gaps(q, t, p.params)
@@ -127,8 +130,8 @@ class ContactScene(eqx.Module):
         drags = drag if flat.rough.size else None, flat.shapes.directions > 1
         return Constraints(held_positions, held_velocities, held, *drags)
 
-    def split_forces(self, flat: "Flat", forces, positions: int, p: InContact) -> tuple:
-        """The forces of all rows, `positions` of them on positions: of constraints, normals (k,) and slips (r, d)."""
+    def split_forces(self, flat: "FlatContacts", forces, positions: int, p: ContactParams) -> tuple:
+        """Split the multipliers, `positions` of them on positions: own constraints, normals (k,), slips (r, d)."""
         one_way, (r, d) = flat.shapes.count - flat.gap_count, (flat.rough.size, flat.shapes.directions)
         gaps, velocities = (flat.gap_count, one_way + r * d) if self.slots is None else self.slots
         first, last = positions - gaps, forces.size - velocities
@@ -138,8 +141,8 @@ class ContactScene(eqx.Module):
             normal, along = normal @ of_gaps, along @ of_velocities
         return own, jnp.append(normal, along[:one_way]), along[one_way:].reshape(r, d)
 
-    def rows(self, flat: "Flat", p: InContact) -> list:
-        """The rows of `slots` as sums over those of all gaps and of all velocities: matrices of 0 and 1."""
+    def rows(self, flat: "FlatContacts", p: ContactParams) -> list:
+        """Return two 0/1 matrices (slots, rows): which row of gaps, and which of velocities, each slot takes."""
         assert self.slots is not None
         found = []
         for held, count in zip(jnp.split(p.contacts.held, [flat.gap_count]), self.slots, strict=True):
@@ -148,17 +151,17 @@ class ContactScene(eqx.Module):
         return found
 
 
-def _row_counts(own: Constraints, layout: Layout, p: InContact) -> tuple[int, int]:
-    """The counts of a system's own constraints, on positions and on velocities."""
+def _row_counts(own: Constraints, layout: Layout, p: ContactParams) -> tuple[int, int]:
+    """Return the numbers of the system's own position constraints and velocity constraints."""
     q, t = jnp.zeros(layout.size, layout.dtype), jnp.zeros((), layout.dtype)
     f = jax.eval_shape(own.f, q, t, p.params).size
     return f, jax.eval_shape(own.a, q, q, t, p.params).size
 
 
-class Flat(NamedTuple):
-    """The functions of contacts in flat coordinates: each takes (q, [qdot,] t, params) with the numbers of params."""
+class FlatContacts(NamedTuple):
+    """The contact functions in flat coordinates: each takes (q, [qdot,] t, params), with arrays for params."""
 
-    shapes: "Shapes"
+    shapes: "ContactShapes"
     gaps: Callable
     one_way: Callable
     slips: Callable  # (r, d)
@@ -174,8 +177,11 @@ class Flat(NamedTuple):
         return self.shapes.rough
 
     @classmethod
-    def from_system(cls, system: System, layout: Layout, params: PyTree) -> "Flat":
-        code, shapes = eqx.filter(params, eqx.is_array_like, inverse=True), Shapes.from_system(system, layout, params)
+    def from_system(cls, system: System, layout: Layout, params: PyTree) -> "FlatContacts":
+        code, shapes = (
+            eqx.filter(params, eqx.is_array_like, inverse=True),
+            ContactShapes.from_system(system, layout, params),
+        )
 
         def call(role: str, vectors, t, numbers):
             function, whole = getattr(system, role), eqx.combine(numbers, code)
@@ -208,12 +214,12 @@ class Flat(NamedTuple):
         return cls(shapes, gaps, one_way, slips, coefficient("restitution"), lambda p: friction(p)[shapes.rough])
 
     def held_slips(self, contacts: Contacts):
-        """1 for every slip that stays zero, (r d,)."""
+        """Return (r d,): 1 for every slip that is held at zero (the contact is closed and sticks), else 0."""
         held = contacts.closed[self.rough] * contacts.sticks
         return jnp.broadcast_to(held[:, None], (held.size, self.shapes.directions)).ravel()
 
-    def slip_direction(self, q, qdot, t, p: InContact):
-        """The unit vectors (r, d) along the slips."""
+    def slip_direction(self, q, qdot, t, p: ContactParams):
+        """Return the unit vectors (r, d) along the slips; of slips at rest, along `Contacts.direction`."""
         given = p.contacts.direction
         if self.shapes.directions == 1:
             return given
@@ -222,18 +228,19 @@ class Flat(NamedTuple):
         aside = jnp.stack([-unit[:, 1], unit[:, 0]], axis=1)
         return (unit + turn[:, None] * aside) / jnp.sqrt(1.0 + turn * turn)[:, None]
 
-    def turning_slips(self, q, qdot, t, p: InContact) -> tuple:
-        """In space the first direction of each slip, (r, 2), and its parts along that and across; (r,)."""
+    def turning_slips(self, q, qdot, t, p: ContactParams) -> tuple:
+        """Return in space `direction` as unit vectors (r, 2), and the slips (r,) along and across them."""
         given, slips = p.contacts.direction, self.slips(q, qdot, t, p.params)
         length = jnp.sqrt((given * given).sum(1))
         unit = given / length[:, None]
         return unit, (slips * unit).sum(1) + length, slips[:, 1] * unit[:, 0] - slips[:, 0] * unit[:, 1]
 
 
-class Shapes(NamedTuple):
-    """The structure of the contacts of a system: k of them, `of_gaps` with a gap, then those of one-way velocities.
+class ContactShapes(NamedTuple):
+    """The structure of a system's k contacts, of which the first `of_gaps` are gaps and the others one-way velocities.
 
-    `rough` (r,) are the places of those with friction, each in `directions` directions; `names` (k,) are those of all.
+    `rough` (r,) are the indices of those with friction, with slips in `directions` dimensions; `names` (k,) are all
+    names.
     """
 
     trees: tuple  # the structures that `contacts` and `one_way` return, None without any
@@ -245,8 +252,8 @@ class Shapes(NamedTuple):
 
     @staticmethod
     @once_for_structure
-    def from_system(system: System, layout: Layout, params: PyTree) -> "Shapes":
-        """Raises `TypeError` or `ValueError` where a function does not return what its role asks for."""
+    def from_system(system: System, layout: Layout, params: PyTree) -> "ContactShapes":
+        """Trace the contact functions; raise `TypeError` or `ValueError` if one returns the wrong structure."""
         trees = [
             None if getattr(system, role) is None else system._output_shapes(role, layout, params)
             for role in ("contacts", "one_way")
@@ -259,7 +266,7 @@ class Shapes(NamedTuple):
             raise ValueError("contacts, or one_way, returns no number: it must return the gaps that stay >= 0.")
         names = system.contact_names(layout, params)
         rough, directions = _friction_directions(system, layout, params, trees[0])
-        shapes = Shapes(tuple(trees), counts[0], sum(counts), rough, directions, names)
+        shapes = ContactShapes(tuple(trees), counts[0], sum(counts), rough, directions, names)
         numbers, code = eqx.partition(params, eqx.is_array_like)
         for role in ("restitution", "friction"):
             function = getattr(system, role)
@@ -277,7 +284,7 @@ class Shapes(NamedTuple):
         return shapes
 
     def spread(self, value: PyTree, role: str):
-        """A coefficient of each contact, (k,): of one number for all, or a dict by name; 0 for one-way velocities."""
+        """Return a coefficient per contact, (k,), of one number or a dict by name; 0 for one-way velocities."""
         tree, none = self.trees[0], jnp.zeros(self.count - self.of_gaps)
         if tree is None:
             return none
@@ -297,12 +304,12 @@ class Shapes(NamedTuple):
         return jnp.concatenate([_spread_coefficient((self.of_gaps,), flat, role), none])
 
     def name_numbers(self, numbers) -> PyTree:
-        """Numbers of all contacts, (…, k), in the structure that the user's functions return."""
+        """Return numbers of all contacts, (…, k), in the structure that the user's contact functions return."""
         return name_numbers(numbers, tuple(tree for tree in self.trees if tree is not None))
 
 
 def _spread_coefficient(shape: tuple[int, ...], value, role: str):
-    """A coefficient for each of some contacts."""
+    """Broadcast `value` to `shape`, one number per gap; raise `ValueError` if it does not fit."""
     try:
         return jnp.broadcast_to(value, shape)
     except ValueError:
@@ -313,7 +320,7 @@ def _spread_coefficient(shape: tuple[int, ...], value, role: str):
 
 
 def _friction_directions(system: System, layout: Layout, params: PyTree, tree: PyTree) -> tuple[np.ndarray, int]:
-    """The places of contacts with friction, and the directions in which each slips."""
+    """Return the indices (r,) of contacts with friction, and the number of directions of a slip."""
     if system.slip is None:
         return np.zeros(0, int), 1
     slip = system._output_shapes("slip", layout, params)
@@ -334,7 +341,7 @@ def _friction_directions(system: System, layout: Layout, params: PyTree, tree: P
 
 
 def _pair_by_name(slip: PyTree, tree: PyTree, places: PyTree) -> list[tuple]:
-    """(slip, gap, places) of every contact that slips; a dict may leave out contacts without friction."""
+    """Return (slip, gap, indices) of each contact with a slip; a dict may leave out contacts without friction."""
     if isinstance(slip, dict) and isinstance(tree, dict):
         if unknown := [name for name in slip if name not in tree]:
             raise ValueError(f"slip names {unknown[0]!r}, and the contacts are {', '.join(map(repr, tree))}.")
@@ -350,7 +357,7 @@ _OPEN = 1e30  # a gap of infinity, which has no series: nothing comes across it,
 
 
 def _replace_infinite(function: Callable) -> Callable:
-    """The function with a large number in place of every infinity that is written in it."""
+    """Return the function with `_OPEN`, a large finite number, in place of every infinite constant in its jaxpr."""
 
     def capped(*arguments):
         program, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
@@ -367,7 +374,7 @@ def _is_infinite(x) -> bool:
 
 
 def _cap_constants(program: Any) -> Any:
-    """A jaxpr, or what a parameter of one holds, with `_OPEN` in place of the infinite numbers in it."""
+    """Replace infinite constants by `_OPEN` in a jaxpr, or in the value of a jaxpr's parameter that contains one."""
     if isinstance(program, tuple | list):
         return type(program)(map(_cap_constants, program))
     if isinstance(program, ClosedJaxpr):

@@ -1,7 +1,7 @@
-"""A scene whose functions ask for `inputs`, as one whose functions ask for `t` and `params` alone.
+"""Replace the argument `inputs` of a scene's functions by parameters, so that they take `t` and `params` alone.
 
-Its parameters are `Driven`: those of the user, and beside them numbers in which a function finds the inputs at the time
-t. `fit` keeps a table of samples there, `linearize` the inputs themselves.
+The parameters become `DrivenParams`: the user's, and data from which `find_inputs(data, t)` computes the inputs at the
+time t. In `fit` the data are a table of samples, in `linearize` the inputs themselves.
 """
 
 import functools
@@ -18,15 +18,15 @@ from lagjax._interface.reads import Edition
 from lagjax._scene._system import ROLES, System, replace_functions
 
 
-class Driven(NamedTuple):
-    """The parameters of a scene with inputs: those of the user, and what the inputs are found in."""
+class DrivenParams(NamedTuple):
+    """Parameters (params of the user, inputs): of a scene with inputs, with data that the inputs are computed from."""
 
     params: PyTree
     inputs: PyTree
 
 
 class _FunctionOfInputs(eqx.Module):
-    """A function of the user, for parameters that are `Driven`; `find_inputs(held, t)` are its inputs."""
+    """A user's function that takes `DrivenParams`, and calls it with `find_inputs(params.inputs, t)` as inputs."""
 
     function: Function
     find_inputs: Callable = eqx.field(static=True)
@@ -35,7 +35,7 @@ class _FunctionOfInputs(eqx.Module):
     def __name__(self) -> str:
         return self.function.name
 
-    def __call__(self, *roles, params: Driven, t=0.0, **more):
+    def __call__(self, *roles, params: DrivenParams, t=0.0, **more):
         extras = {"t": t, "params": params.params, **more}
         if "inputs" in self.function.extras:
             extras["inputs"] = self.find_inputs(params.inputs, t)
@@ -43,7 +43,7 @@ class _FunctionOfInputs(eqx.Module):
 
 
 def drive_scene(system: System, find_inputs: Callable, extras: tuple[str, ...] = ("params",)) -> System:
-    """The scene for parameters that are `Driven`; `extras` are what finding the inputs takes, "params" or "t" too."""
+    """Return the scene for `DrivenParams`; `extras` names what `find_inputs` depends on: "params", or "t" too."""
     arrays, scene = jax.tree.flatten(system)
     return _drive_system(system, find_inputs, extras) if arrays else _driven_from_tree(scene, find_inputs, extras)
 
@@ -61,20 +61,20 @@ def _drive_system(system: System, find_inputs: Callable, extras: tuple[str, ...]
 
 
 def drive_function(function: Function, find_inputs: Callable, extras: tuple[str, ...]) -> Function:
-    """A function of a scene for parameters that are `Driven`, as `drive_scene` makes it of all."""
+    """Return one function of a scene for `DrivenParams`; `drive_scene` does this for all."""
     arrays, code = eqx.partition(_FunctionOfInputs(function, find_inputs), eqx.is_array)
     finding = extras if "inputs" in function.extras else ("params",)  # laws of contacts take nothing else
     asked = tuple(x for x in dict.fromkeys((*finding, *function.extras)) if x != "inputs")
     return Function(arrays, Edition.from_function(code), asked)
 
 
-def held_inputs(held: PyTree, t: Any) -> PyTree:
-    """The inputs of a scene in which they are held."""
+def constant_inputs(held: PyTree, t: Any) -> PyTree:
+    """A `find_inputs` for inputs that are constant in time: returns them."""
     return held
 
 
-def push_by_inputs(system: System) -> System:
-    """The scene with further generalised forces: its `inputs`, in the structure of q."""
+def add_input_forces(system: System) -> System:
+    """Return the scene with its `inputs`, in the structure of q, added to the generalised forces."""
     own = system.forces
 
     def forces(q, qdot, t, params, inputs, **more):
@@ -87,7 +87,7 @@ def push_by_inputs(system: System) -> System:
     return replace_functions(system, {"forces": pushed})
 
 
-def asking_for_inputs(system: System) -> list[str]:
-    """The roles of functions of the scene that ask for `inputs`."""
+def roles_with_inputs(system: System) -> list[str]:
+    """Return the roles of the scene's functions that take `inputs`."""
     functions = ((role, getattr(system, role)) for role in ROLES)
     return [role for role, function in functions if function is not None and "inputs" in function.extras]

@@ -82,7 +82,7 @@ class Explanation:
     contacts: tuple[str, ...] = ()
 
     def with_constraints(self, names: list[str], schur_complement: np.ndarray | None) -> "Explanation":
-        """The explanation with the names of constraints; where G M⁻¹ Gᵀ is known, with the dependent ones."""
+        """Return this with the constraints' names and, given G M⁻¹ Gᵀ (m, m), the linearly dependent ones."""
         dependent = None
         if schur_complement is not None:
             dependent = {
@@ -125,7 +125,7 @@ class Explanation:
 
 
 def explain(problem: Problem) -> Explanation:
-    """The facts about the scene of a problem, and which engine is chosen for it."""
+    """Collect the facts about the scene of a problem, and choose its engine."""
     derivation = problem.derivation
     names, n, motion = derivation.layout.names, derivation.layout.size, derivation.motion
     known = {"coordinates": names, **_engine_facts(problem)}
@@ -156,7 +156,7 @@ def explain(problem: Problem) -> Explanation:
 
 
 def _facts_of_arrays(derivation: Derivation) -> dict[str, Any]:
-    """The facts about a large scene, from what the operations of its functions read, whether or not it cancels."""
+    """Return the facts about a scene that runs on arrays, by what its operations read, even if that cancels."""
     motion, cyclic, form = derivation.motion, derivation.cyclic, derivation.form.mass
     names, inputs = derivation.layout.names, ("q", "dq", "t")
 
@@ -180,7 +180,7 @@ def _facts_of_arrays(derivation: Derivation) -> dict[str, Any]:
 
 
 def _engine_facts(problem: Problem) -> dict[str, Any]:
-    """The default solver of a motion, the form in which it evaluates the equations, and the cost of that."""
+    """Return the fields about the engine: default solver, path, reason, and operation counts."""
     derivation, refusal = problem.derivation, choose(problem).refusal
     if problem.system.touches and MachineCode().refuses(problem) is None:  # however large: arrays do not jump
         derivation, refusal = derivation.lowered, None
@@ -200,7 +200,7 @@ def _engine_facts(problem: Problem) -> dict[str, Any]:
 
 
 def _border_facts(problem: Problem, inputs: tuple[str, ...]) -> dict[str, Any]:
-    """The borders and the narrow features of the accelerations, each by what it is and which inputs it reads."""
+    """Return the fields on borders and narrow functions of the accelerations: each operation and what it reads."""
     derivation, n = problem.derivation, problem.derivation.layout.size
     try:
         borders = derivation.borders
@@ -230,7 +230,7 @@ def _borders_in_lines(problem: Problem) -> dict[str, Any]:
 
 
 def _list_names(names: tuple[str, ...], counts: bool = True) -> str:
-    """Names, or of a large group the first and the last of them, and their number where `counts` says so."""
+    """Return names as text; of more than `_GROUPED` only the first and the last, with their number if `counts`."""
     if len(names) <= _GROUPED:
         return join_names(names, _LISTED)
     return f"{f'{len(names)}: ' if counts else ''}{names[0]} … {names[-1]}"
@@ -241,7 +241,7 @@ def _count_names(names: tuple[str, ...]) -> str:
 
 
 def _pattern_kind(parts: Program, n: int) -> str:
-    """Diagonal, block-diagonal or dense: the connected parts of the graph of entries that are not zero."""
+    """Return "diagonal", "block-diagonal" or "dense" for a program of (n, n) entries, by which entries are not zero."""
     filled = np.array([[parts.constant(n * i + j) != 0 for j in range(n)] for i in range(n)])
     if not (filled & ~np.eye(n, dtype=bool)).any():
         return "diagonal"

@@ -102,7 +102,7 @@ def samples(
 
 
 def _check_samples(knots: Any, values: Any, hold: str) -> tuple:
-    """Knots and values as arrays of floats of one precision; what is known is copied."""
+    """Return knots and values as float arrays of one dtype; raise for samples that `samples` does not take."""
     arrays = []
     for name, x in (("knots", knots), ("values", values)):
         x = x if hasattr(x, "dtype") else np.asarray(x)
@@ -143,7 +143,7 @@ def _require_increasing(knots: np.ndarray) -> None:
 
 
 def unevenly_spaced(knots: np.ndarray, name: str) -> str | None:
-    """A sentence for instants (K,) that "band" cannot take, because they are not evenly spaced."""
+    """Return an error message if the knots (K,) are not evenly spaced, as "band" requires; else None."""
     knots = knots if knots.dtype.kind == "f" else knots.astype(float)
     steps, (spacing, tolerance) = np.diff(knots), _mean_spacing(knots[0], knots[-1], len(knots))
     i = int(np.argmax(np.abs(steps - spacing)))
@@ -156,14 +156,16 @@ def unevenly_spaced(knots: np.ndarray, name: str) -> str | None:
 
 
 def _mean_spacing(first, last, count: int) -> tuple:
-    """The mean distance of instants, and how far from it that of two neighbours may be where they are even."""
+    """Return the mean spacing of `count` knots, and the largest deviation from it that counts as even."""
     mean, eps = (last - first) / (count - 1), np.finfo(first.dtype).eps
     return mean, _UNEVEN * mean + 4 * eps * (abs(first) + abs(last))
 
 
-def continued(values: np.ndarray, count: int, hold: str) -> np.ndarray:
-    """`count` samples (count, …) behind the last of `values` (K, …), at even instants, which change nothing before it:
-    a parabola for "cubic", the reflection for "band" (of 16 samples at least), else the last sample."""
+def append_samples(values: np.ndarray, count: int, hold: str) -> np.ndarray:
+    """Return `count` samples (count, …) to append to `values` (K, …), which keep the function on the given knots.
+
+    A parabola for "cubic", the reflection for "band" (of 16 samples at least), else the last sample.
+    """
     last, behind = values[-1], np.arange(1, count + 1)
     if hold == "band":
         return 2.0 * last - values[np.maximum(len(values) - 1 - behind, 0)]
@@ -227,7 +229,7 @@ def _band_limited_value(knots, values, t):
 
 @functools.cache
 def _weight_polynomials() -> np.ndarray:
-    """The weight of sample i − 15 + k in the piece from sample i on, by powers of c = 2 s − 1 in [−1, 1], (10, 32)."""
+    """Return (10, 32): powers of c = 2 s − 1 in [−1, 1] by samples, of the weight of sample i − 15 + k in piece i."""
     # They interpolate at Chebyshev's points with both ends, so that u passes through its samples.
     nodes = -np.cos(np.pi * np.arange(_DEGREE + 1) / _DEGREE)
     distance = 0.5 * (nodes[:, None] + 1.0) - np.arange(1 - _HALF, _HALF + 1)
@@ -237,13 +239,13 @@ def _weight_polynomials() -> np.ndarray:
 
 
 def _piece_index(knots, t):
-    """The piece that a time is on, and whether that is one of those between two knots."""
+    """Return the index of the piece that contains t, and True where t is between the first and the last knot."""
     i = _locate_knots(knots, jnp.asarray(t, knots.dtype), closed=True)
     return i, (i >= 0) & (i < len(knots) - 1)
 
 
 def _end_slopes(knots, values, i, chord):
-    """The slopes at both ends of piece i: of the parabolas through three samples."""
+    """Return the slopes at both ends of piece i, of the parabolas through three samples; `chord` is its mean slope."""
     count = len(knots)
     if count == 2:
         return chord, chord
@@ -266,7 +268,7 @@ def _end_slopes(knots, values, i, chord):
 
 
 def _table_window(table, start, size: int) -> list:
-    """Entries `start`, `start` + 1, … of a table, `size` of them; those that fit, where these would stick out."""
+    """Return entries `start`, …, `start + size − 1` of a table as a list; near an end the nearest window that fits."""
     where = start.ndim
     offsets = tuple(range(where, where + table.ndim))
     dimensions = jax.lax.GatherDimensionNumbers(offsets, collapsed_slice_dims=(), start_index_map=(0,))
@@ -275,7 +277,7 @@ def _table_window(table, start, size: int) -> list:
 
 
 def _expand_like(x, v):
-    """An array over times, for arithmetic with one over times and columns."""
+    """Append an axis to x, an array over times, if v also has columns, so that the two broadcast."""
     return x if x.ndim == v.ndim else x[..., None]
 
 
@@ -283,7 +285,7 @@ def _expand_like(x, v):
 
 
 def _locate_knots(knots, t, closed: bool):
-    """Knots that are at most t, less one, of int32; with `closed` the last knot belongs to the last piece."""
+    """Return (number of knots ≤ t) − 1 as int32; with `closed` the last knot belongs to the last piece."""
     return _locate_p.bind(jnp.asarray(knots), t, closed=closed)
 
 

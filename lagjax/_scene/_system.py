@@ -1,7 +1,7 @@
-"""`System`: the scene as its author describes it, and the physics one can ask of a single state.
+"""`System`: the user's description of a mechanical system, and physical quantities at a single state.
 
-A `System` holds the user's functions, checked for their signatures when it is built and for what they return when they
-first meet a state. `System._motion(layout)` is the same scene in flat coordinates, as an integration takes it.
+A `System` contains the user's functions. Their signatures are checked when it is built, what they return when they are
+first evaluated. `System._motion(layout)` is the same in flat coordinates, for an integration.
 """
 
 import dataclasses
@@ -387,7 +387,7 @@ class System(eqx.Module):
         return registered().write_c(self, layout, params, inputs, name, dtype)
 
     def _motion(self, layout: Layout, params: PyTree = None) -> Motion:
-        """The scene in the flat coordinates of `layout`, after a look at what its functions return there."""
+        """Return the equations in the flat coordinates of `layout`; raise if a function has the wrong output."""
         # The functions of the result take the numbers in `params` alone, with None in the place of everything else.
         self._check_outputs(layout, params)
 
@@ -408,7 +408,7 @@ class System(eqx.Module):
         return dataclasses.replace(motion, forces=forces)
 
     def _flat_function(self, role: str, layout: Layout, params: PyTree, to_array: Callable) -> Any:
-        """The user's function in flat coordinates, the last of which are (t, params); `to_array` flattens its value."""
+        """Return the user's function with flat arguments (…, t, params); `to_array` flattens what it returns."""
         function: Any = getattr(self, role)
         code = eqx.filter(params, eqx.is_array_like, inverse=True)  # functions and strings: no part of the data
 
@@ -420,9 +420,9 @@ class System(eqx.Module):
         return function and flat
 
     def multiplier_law(self, layout: Layout, params: PyTree) -> Callable:
-        """Q(q, qdot, t, params, multipliers) of forces that read multipliers (m,), all flat.
+        """Return Q(q, qdot, t, params, multipliers), all flat, of forces that read multipliers (m,).
 
-        They are those of constraints, then of contacts, which are open where there are no more.
+        The multipliers are those of constraints, then of contacts; missing ones, of open contacts, are zero.
         """
         forces = self._flat_function("forces", layout, params, layout.flatten)
         trees = self._role_shapes(self._multiplier_roles, layout, params)
@@ -445,11 +445,11 @@ class System(eqx.Module):
         return self._split_by_constraint(flat, Layout.from_state(q, qdot), params)
 
     def _split_by_constraint(self, flat: jax.Array, layout: Layout, params: PyTree) -> PyTree:
-        """`flat` (m,), a number for each constraint, in the structure of `multipliers`."""
+        """Return `flat` (m,), a number for each constraint, in the structure of `multipliers`."""
         return name_numbers(flat, self._constraint_structure(layout, params))
 
     def _constraint_structure(self, layout: Layout, params: PyTree) -> tuple:
-        """The shapes that the constraint functions return, a tuple of one or two pytrees."""
+        """Return the shapes that the constraint functions return, a tuple of one or two pytrees."""
         return self._role_shapes(self._constraint_roles, layout, params)
 
     def _role_shapes(self, roles: list[str], layout: Layout, params: PyTree) -> tuple:
@@ -471,11 +471,11 @@ class System(eqx.Module):
         return self._constraint_roles + self._contact_roles
 
     def constraint_names(self, layout: Layout, params: PyTree) -> list[str]:
-        """A name for each of the m constraints, such as constraints['rod'] or velocity_constraints[1]."""
+        """Return a name for each of the m constraints, such as constraints['rod'] or velocity_constraints[1]."""
         return self._output_names(self._constraint_roles, layout, params)
 
     def contact_names(self, layout: Layout, params: PyTree) -> tuple[str, ...]:
-        """A name for each gap and one-way velocity, such as contacts['floor'] or one_way[1]."""
+        """Return a name for each gap and one-way velocity, such as contacts['floor'] or one_way[1]."""
         return tuple(self._output_names(self._contact_roles, layout, params))
 
     def _output_names(self, roles: list[str], layout: Layout, params: PyTree) -> list[str]:
@@ -487,7 +487,7 @@ class System(eqx.Module):
         return names
 
     def _required_force(self, q: PyTree, qdot: PyTree, t: Time, params: PyTree, qddot: PyTree) -> tuple:
-        """`Motion.required_force` in the structure of `q`, and the place of a constraint that qddot violates, or −1.
+        """Return the force that gives `qddot`, like `q`, and the index of a constraint that qddot violates, or −1.
 
         Where it violates one, the forces are NaN.
         """
@@ -497,9 +497,9 @@ class System(eqx.Module):
         return layout.restore(nan_unless(place < 0, force) if violated.size else force), place.astype(float)
 
     def _evaluate_quantity(self, quantity: Callable, q, qdot, t, params, restore: bool = False, **more: PyTree):
-        """One of `Motion`'s functions at a state in the user's pytree, back in that pytree where `restore` says so.
+        """Evaluate a method of `Motion` at a state given as pytrees; with `restore` the result is a pytree like q.
 
-        It takes `more` pytrees like q.
+        `more` are further arguments of the method, pytrees like q.
         """
         self, layout = present_system(self), Layout.from_state(q, qdot)
         require_number(t, "t")
@@ -524,7 +524,7 @@ class System(eqx.Module):
         return jax.tree.map(jnp.asarray, layout.restore(value) if restore else value)
 
     def _evaluate_program(self, quantity: Callable, layout: Layout, q, qdot, t, params) -> np.ndarray | None:
-        """A quantity at a state of numbers, from the scene's programs in NumPy; None where traced, or without these."""
+        """Evaluate a quantity at a concrete state by scalar programs in NumPy; None if traced or on arrays."""
         concrete = all(is_concrete(leaf) for leaf in jax.tree.leaves((self, q, qdot, t, params)))
         if self.path == "array" or quantity not in OF_QUANTITIES or not concrete:
             return None
@@ -540,7 +540,7 @@ class System(eqx.Module):
             return function(values, qdot)[0]
 
     def _check_outputs(self, layout: Layout, params: PyTree) -> None:
-        """Trace each function once, on shapes alone, and say what is wrong with what it returns."""
+        """Trace each function once, on shapes alone; raise `TypeError` if it returns a wrong structure."""
         for role in ("lagrangian", "dissipation", "forces"):
             if getattr(self, role) is None:
                 continue
@@ -562,7 +562,7 @@ class System(eqx.Module):
         _require_own_names(shapes)
 
     def _output_shapes(self, role: str, layout: Layout, params: PyTree) -> PyTree:
-        """The shapes that the function of a role returns, traced on shapes alone."""
+        """Return the shapes that the function of this role returns, traced on shapes alone."""
         numbers, code = eqx.partition(params, eqx.is_array_like)
         function, count = getattr(self, role), len(ARGUMENTS[role])
         state, t = layout.restore(np.zeros(layout.size, layout.dtype)), np.zeros((), layout.dtype)
@@ -573,7 +573,7 @@ class System(eqx.Module):
         )  # fmt: skip
 
     def multiplier_shapes(self, layout: Layout, params: PyTree) -> dict[str, PyTree]:
-        """The shapes of what the forces are called with beside t and params: of the multipliers, if they read them."""
+        """Return {"multipliers": shapes}, the extra argument of forces that read multipliers; {} for other forces."""
         if not self.reads_multipliers:
             return {}
         trees = self._role_shapes(self._multiplier_roles, layout, params)
@@ -582,7 +582,7 @@ class System(eqx.Module):
 
 
 def describe_violation(constraint: str) -> str:
-    """A sentence for an acceleration that a constraint does not allow."""
+    """Return the error message for an acceleration that this constraint does not allow."""
     return (
         f"qddot violates the constraint {constraint}, so that no force brings it about: q̈ has to satisfy G q̈ = γ. The "
         "nearest one that does is the acceleration of this System with forces=lambda q, v: tau, where tau = "
@@ -591,12 +591,12 @@ def describe_violation(constraint: str) -> str:
 
 
 def count_numbers(trees: PyTree) -> int:
-    """The count of numbers in arrays, or in their shapes."""
+    """Return the total number of elements of the arrays, or of the shapes, in a pytree."""
     return sum(x.size for x in jax.tree.leaves(trees))
 
 
 def name_numbers(numbers, trees: tuple) -> PyTree:
-    """Numbers (…, m) in these structures, end to end: one dict where all are dicts, else a tuple of several."""
+    """Split numbers (…, m) into the structures `trees`: one dict if all are dicts, else a tuple of several."""
     leaves, structure = jax.tree.flatten(trees)
     ends = np.cumsum([leaf.size for leaf in leaves])
     pieces = (numbers[..., end - leaf.size : end] for end, leaf in zip(ends, leaves, strict=True))
@@ -610,7 +610,7 @@ def name_numbers(numbers, trees: tuple) -> PyTree:
 
 
 def _coefficients(contacts, one_way, restitution, friction, slip) -> tuple:
-    """Restitution and friction as functions of params; None without contacts. Raises `ValueError`."""
+    """Return restitution and friction as functions of params, None without contacts; raise `ValueError`."""
     given = {"restitution": restitution, "friction": friction}
     given = {name: 0.0 if value is None else value for name, value in given.items()}
     if contacts is None:
@@ -650,12 +650,12 @@ def _require_range(name: str, values: PyTree) -> None:
 
 
 def _constant_function(value) -> Callable:
-    """A function that gives a value which it closes over: by that, editions of functions tell them apart."""
+    """Return a function without arguments that returns `value`, in its closure, where an `Edition` reads it."""
     return lambda: value
 
 
 def require_system(system: Any, contacts: bool = False) -> System:
-    """The scene with its functions as they are now (`Function.now`): what every public function begins with."""
+    """Raise `TypeError` if this is no `System`, else return it with the current edition of its functions."""
     # Raises `TypeError` for anything else in its place, a bare Lagrangian most often; and for a scene with contacts,
     # where these would be left out.
     if not isinstance(system, System):
@@ -677,7 +677,7 @@ def require_system(system: Any, contacts: bool = False) -> System:
 
 
 def present_system(system: System) -> System:
-    """The scene with its functions as they are now: this one, where nothing that they read has changed."""
+    """Return the scene with the current `Edition` of each function; the same object if none has changed."""
     fields = object.__getattribute__(system, "__dict__")  # an attribute of an equinox.Module takes 2 µs
     functions = [fields[role] for role in ROLES]
     now = [present(f) if isinstance(f, Function) else f for f in functions]
@@ -687,7 +687,7 @@ def present_system(system: System) -> System:
 
 
 def replace_functions(system: System, functions: dict[str, Function | None], path: str | None = None) -> System:
-    """The scene with some functions replaced, by their roles. The constructor would read all signatures again."""
+    """Return a copy of the scene with other functions by role, without the constructor, which is slow."""
     other, fields = object.__new__(type(system)), object.__getattribute__(system, "__dict__")
     for name, value in (fields | functions | {"path": path or fields["path"]}).items():
         object.__setattr__(other, name, value)
@@ -702,7 +702,7 @@ def drop_contacts(system: System) -> System:
 
 @eqx.filter_jit
 def _evaluate_motion(system: System, quantity: Callable, q, qdot, t, params, **more):
-    """One of `Motion`'s functions, compiled whole: XLA would take seconds to prepare its operations one by one."""
+    """Evaluate a method of `Motion` in one jitted program; without `jit` XLA would compile operation by operation."""
     layout = Layout.from_state(q, qdot)
     numbers, derivation = eqx.filter(params, eqx.is_array), derivation_of(system, layout, params)
     motion = derivation.motion if system.path == "array" else lowered_motion(derivation)

@@ -1,11 +1,11 @@
-"""The look of a result: as text, in a notebook, as a film, as labelled arrays; `lagjax.plot` draws the figures.
+"""The display of a result: as text, in a notebook, as an animation, as labelled arrays; `lagjax.plot` draws figures.
 
-_summary     the three lines of a trajectory
+_summary     the three-line summary of a trajectory
 _notebook    the HTML of a result: its text, and a small picture
-_course      a motion between its outputs
+_course      a motion interpolated between its outputs
 _animation   a motion as a film
 _c_source    the equations of a scene in C
-_equations_text   the equations of a scene to read, in formulas of _formula_text
+_equations_text   the equations of a scene as formulas, which _formula_text writes
 _export      a trajectory as an xarray.Dataset or a pandas.DataFrame
 """
 

@@ -55,7 +55,7 @@ class Animation:
         return f"Animation from t = {begin:.6g} to {end:.6g}, {seconds}: save it to .gif, .mp4 or .html"
 
     def _repr_html_(self) -> str | None:
-        """The film itself, for notebooks; None where it cannot be made."""
+        """Return the film as HTML for notebooks; None if it cannot be made."""
         try:
             return self._film_html()
         except Exception:  # a display must not fail
@@ -89,7 +89,7 @@ class Animation:
             raise ValueError(f"The suffix of {str(path)!r} names no film: write {known}; got {suffix!r}.")
 
     def _write_gif(self, path) -> None:
-        """Write the pictures one after another, so that no more than one of them is in memory in its full colours."""
+        """Write a GIF frame by frame, so that only one frame is in memory in full colour."""
         from PIL import Image  # comes with matplotlib
 
         hundredths = max(2, round(100 / self.fps))  # browsers show frames of a hundredth for ten of them
@@ -114,7 +114,7 @@ class Animation:
             self._film().save(path, writer=matplotlib.animation.FFMpegWriter(fps=self.fps), dpi=_DPI)
 
     def _film_html(self) -> str:
-        """The film as HTML: a video where ffmpeg is there, else pictures and a few lines of JavaScript."""
+        """Return the film as HTML: a video if ffmpeg is installed, else images with a little JavaScript."""
         matplotlib, program = _import_matplotlib(), _find_ffmpeg()
         # Beyond its limit matplotlib leaves frames out, or the whole video.
         options = {"animation.embed_limit": _LARGEST_PAGE, "savefig.dpi": _DPI}
@@ -127,7 +127,7 @@ class Animation:
         return _import_matplotlib().animation.FuncAnimation(figure, show, **options)
 
     def _figure(self, fps: float) -> tuple[Any, Callable, int]:
-        """The figure, a function that sets it to frame i, and how many frames there are."""
+        """Return the figure, a function that draws frame i in it, and the number of frames."""
         matplotlib, times = _import_matplotlib(), self.times(fps)
         positions, traces = self.positions(times), self._traces(times)
         limits = _axis_limits([*positions.values(), *(path for _, _, path in traces)])
@@ -140,7 +140,7 @@ class Animation:
         return figure, show, len(times)
 
     def _traces(self, times: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """The traces: of every member and traced point its name, the times (F,) and the places (F, 2 or 3)."""
+        """Return (name, times (F,), positions (F, 2 or 3)) of the trace of every traced point in every member."""
         if not self.traces:
             return []
         finer = np.interp(np.arange(FINER * (len(times) - 1) + 1) / FINER, np.arange(len(times)), times)
@@ -149,7 +149,7 @@ class Animation:
 
 
 def make_animation(trajectory, points: Callable, trace, speed: float, fps: float) -> Animation:
-    """The `Animation` of a trajectory; see `Trajectory.animate`."""
+    """Return the `Animation` of a trajectory; see `Trajectory.animate`."""
     for name, value in (("speed", speed), ("fps", fps)):
         if isinstance(value, bool) or np.ndim(value) or not np.isreal(value) or not 0 < value < np.inf:
             raise ValueError(f"{name} must be a positive number; got {value!r}.")
@@ -191,7 +191,7 @@ def make_animation(trajectory, points: Callable, trace, speed: float, fps: float
 
 
 def _positions(function: Function, members: Members, k: int, q: np.ndarray, times: np.ndarray) -> dict[str, np.ndarray]:
-    """The points (frames, number, 2 or 3) of a member at its states q (frames, n), by name; NaN where q is."""
+    """Evaluate the points of member k at its states q (frames, n): {name: (frames, k, 2 or 3)}; NaN where q is."""
     states = members.layout.restore(q.astype(members.layout.dtype))
     named = _evaluate_points(function, states, times.astype(members.layout.dtype), members.params_of(k))
     known = np.all(np.isfinite(q), axis=1)[:, None, None]
@@ -210,7 +210,7 @@ def _evaluate_points(function: Function, states, times, params):
 
 
 def require_points(name, value: np.ndarray) -> np.ndarray:
-    """The positions of one point or line at F frames, (F, k, 2 or 3). Raises `ValueError` for another shape."""
+    """Return the positions of a point or line at F frames as (F, k, 2 or 3); raise `ValueError` for other shapes."""
     if value.ndim == 2:  # one point
         value = value[:, None, :]
     if value.ndim != 3 or value.shape[-1] not in (2, 3):
@@ -223,7 +223,7 @@ def require_points(name, value: np.ndarray) -> np.ndarray:
 
 
 def _parse_trace(trace, shapes: dict[str, tuple[int, ...]]) -> tuple[tuple[str, int], ...]:
-    """The points that leave a trace, (name, place) each, from the argument `trace`: a name is its line's last point."""
+    """Return (name, index) of each point that leaves a trace; a name alone in `trace` means its line's last point."""
     if len({shape[-1] for shape in shapes.values()}) > 1:
         raise ValueError("points has some in the plane and some in space: give all of them two numbers, or three.")
     if trace is None:
@@ -244,7 +244,7 @@ def _parse_trace(trace, shapes: dict[str, tuple[int, ...]]) -> tuple[tuple[str, 
 
 
 def _draw_film(ax, positions: dict[str, np.ndarray], times: np.ndarray, traces, trail: int) -> tuple[Callable, list]:
-    """Set the figure up; a function that sets it to frame i, and the artists to draw for it."""
+    """Create the artists; return a function that draws frame i, and the artists that change between frames."""
     space = ax.name == "3d"
     opacity = max(0.2, len(next(iter(positions.values()))) ** -0.5)
     lines, faded, forward = [], [], np.sign(times[-1] - times[0])
@@ -277,7 +277,7 @@ def _draw_film(ax, positions: dict[str, np.ndarray], times: np.ndarray, traces, 
 
 
 def _cache_background(figure, moving: list) -> None:
-    """Draw all but the `moving` artists once: axes take ten times as long, and `blit` is for windows only."""
+    """Make the figure draw everything but the `moving` artists only once: axes are slow, and `blit` needs a window."""
     draw_all, kept = figure.draw, []
     order = figure.axes[0].get_children()
     moving = sorted(sorted(moving, key=order.index), key=lambda artist: artist.get_zorder())
@@ -318,7 +318,7 @@ def _build_axes(figure, low: np.ndarray, high: np.ndarray):
 
 
 def _axis_limits(points: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """The box of all points, a twentieth wider, and no side less than a tenth of the longest."""
+    """Return the lower and upper corners of a box around all points, 5 % wider; no side below 10 % of the longest."""
     every = np.concatenate([array.reshape(-1, array.shape[-1]) for array in points])
     every = every[np.isfinite(every).all(axis=1)]
     if not len(every):
@@ -329,7 +329,7 @@ def _axis_limits(points: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _figure_size(low: np.ndarray, high: np.ndarray) -> tuple[float, float]:
-    """Width and height of the figure in inches, even numbers of dots, as videos need them."""
+    """Return width and height of the figure in inches: even numbers of pixels, which video codecs require."""
     if len(low) == 3:
         return _SIZE, _SIZE
     width, height = (high - low) / (high - low).max()
@@ -337,7 +337,7 @@ def _figure_size(low: np.ndarray, high: np.ndarray) -> tuple[float, float]:
 
 
 def _add_trace(ax, space: bool):
-    """An empty line whose pieces have colours of their own."""
+    """Add an empty line collection to the axes, whose segments have a colour each."""
     if space:
         from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
@@ -346,7 +346,7 @@ def _add_trace(ax, space: bool):
 
 
 def _time_digits(times: np.ndarray) -> int:
-    """Decimal places that tell frames apart, up to 6."""
+    """Return the number of decimals, at most 6, that distinguishes the times of neighbouring frames."""
     step = abs(times[1] - times[0]) if len(times) > 1 else 1.0
     return int(np.clip(np.ceil(-np.log10(10 * step)), 0, 6))
 

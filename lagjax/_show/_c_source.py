@@ -1,9 +1,9 @@
-"""The equations of a scene as text in C99: accelerations, mass matrix, energy and a step of fixed length.
+"""The equations of a scene as C99 source: accelerations, mass matrix, energy and a step of fixed length.
 
-Each function is a straight line of the scene (`_native._c_lines`), with a comment that says what stands where. The step
-is the classical one of Runge and Kutta: it takes four accelerations and no memory, whereas a step of a Taylor series,
-which reaches more digits, takes a recurrence of each order for each operation. With constraints every step ends with
-one Newton step back to them.
+Each function is a straight line of the scene (`_native._c_lines`), with a comment on its arguments. The step is the
+classical Runge-Kutta step: it takes four accelerations and no memory, whereas a step of a Taylor series, which is more
+accurate, takes a recurrence of each order for each operation. With constraints every step ends with one Newton step
+back to them.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from lagjax._equations import Derivation, derivation_of
 from lagjax._interface import VERSION, Layout, number_names
 from lagjax._native import CNumbers, write_function
 from lagjax._program import Graph, StraightLine, Unlowerable, eliminate_dead_code
-from lagjax._scene import Driven, drive_scene, held_inputs
+from lagjax._scene import DrivenParams, constant_inputs, drive_scene
 from lagjax._tracing import Program, fold, lower_formula, stack
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def write_c(system: "System", layout: Layout, params: PyTree, inputs: PyTree, na
         )
     places = {"q": layout.names, "params": number_names(params, "params"), "inputs": number_names(inputs, "inputs")}
     if inputs is not None:
-        system, params = drive_scene(system, held_inputs), Driven(params, inputs)
+        system, params = drive_scene(system, constant_inputs), DrivenParams(params, inputs)
     try:
         derivation = derivation_of(system, layout, params).with_numbers().lowered
         return _SceneSource(derivation, name, CNumbers(dtype), places).text()
@@ -89,7 +89,7 @@ def write_c(system: "System", layout: Layout, params: PyTree, inputs: PyTree, na
 
 
 class _SceneSource:
-    """The text of a scene in C, whose functions begin with `name`."""
+    """Writes the C source of a scene, with function names that begin with `name`."""
 
     def __init__(self, derivation: Derivation, name: str, numbers: CNumbers, places: dict[str, Sequence[str]]):
         self.derivation, self.name, self.numbers, self.places = derivation, name, numbers, places
@@ -106,7 +106,7 @@ class _SceneSource:
         return "\n".join([head, *helpers, *functions])
 
     def _write_functions(self) -> dict[str, tuple[StraightLine, str]]:
-        """The functions: the line of each, and a comment."""
+        """Return {function name: (its straight line, a comment)}."""
         of, n = self.derivation, self.n
         lines = {
             "acceleration": (_settle(of.accelerations.program.complete.line), f"qddot[{n}]; NaN where M is singular"),
@@ -124,7 +124,7 @@ class _SceneSource:
         return f"/* {says} */\n{write_function(f'{self.name}_{what}', line, arguments, self._read_input, self.numbers)}"
 
     def _read_input(self, i: int) -> str:
-        """Input i of a line, in C."""
+        """Return the C expression of input i of a straight line."""
         n, count = self.n, len(self.places["params"])
         if i < 2 * n + 1:
             return f"q[{i}]" if i < n else f"qdot[{i - n}]" if i < 2 * n else "t"
@@ -142,7 +142,7 @@ class _SceneSource:
 
 
 def _settle(line: StraightLine) -> StraightLine:
-    """Accelerations that are NaN where the last output says that they are not determined."""
+    """Return accelerations that are NaN where the line's last output, the singularity indicator, is positive."""
     graph = Graph.from_line(line, 2 * len(line.nodes) + 10)
     *values, singular = line.outputs
     if graph.kinds[singular] != "bool":

@@ -1,8 +1,8 @@
-"""`Course`: a motion between its outputs, for every picture of one.
+"""`Course`: a motion as a function of time between its outputs, for figures and animations.
 
-A trajectory is known at its outputs, just before and just after its transitions, and at the event that ended it: these
-are the knots. Between two of them the state follows the cubic that has q and q̇ of both ends (Hermite). Where a
-transition resets the state, two knots have one time, and nothing joins them.
+Its knots are the outputs, the states just before and just after transitions, and the event that ended the motion.
+Between two knots the state is the cubic with q and q̇ of both (Hermite interpolation). Where a transition resets the
+state, two knots have the same time, and the curve is interrupted.
 """
 
 from typing import NamedTuple
@@ -19,14 +19,14 @@ POINTS = 2400
 
 
 class Course(NamedTuple):
-    """The knots of one member in their order: times (K,), q (K, n) and q̇ (K, n)."""
+    """The knots of one member in the order of the motion: times (K,), q (K, n) and q̇ (K, n)."""
 
     t: np.ndarray
     q: np.ndarray
     qdot: np.ndarray
 
     def states_at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """q and q̇ (F, n) at some times, before a jump at that instant; NaN beyond the ends, but for rounding."""
+        """Interpolate q and q̇ (F, n) at `times`; at a jump the state before it; NaN outside of the motion."""
         low, high = sorted((self.t[0], self.t[-1]))
         slack, sign = 1e-6 * (high - low), np.sign(self.t[-1] - self.t[0])
         place = np.clip(np.searchsorted(sign * self.t, sign * times, side="left") - 1, 0, len(self.t) - 2)
@@ -43,7 +43,7 @@ class Course(NamedTuple):
         return np.where(inside, q, np.nan), np.where(inside, qdot, np.nan)
 
     def curve(self, times: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """t (F,), q and q̇ (F, n) at all knots and `times`, by default `POINTS` even ones; a row of NaN at jumps."""
+        """Return t (F,), q, q̇ (F, n) at knots and `times`, by default `POINTS` even ones; a row of NaN at jumps."""
         if times is None:
             count = len(self.t) - 1
             parts = np.arange(1, max(2, -(-POINTS // count))) / max(2, -(-POINTS // count))
@@ -57,15 +57,14 @@ class Course(NamedTuple):
 
 
 def join_curve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """A curve (2, F) in a plane, without the gaps across which both of these go on."""
+    """Return the curve (2, F) of x and y without the NaN at jumps across which both are continuous."""
     xy = np.stack([x, y])
     gaps = 1 + np.flatnonzero(np.isnan(y[1:-1]))
     return np.delete(xy, gaps[(xy[:, gaps - 1] == xy[:, gaps + 1]).all(axis=0)], axis=1)
 
 
 def wrap_curve(x: np.ndarray, y: np.ndarray, of_x: float | None, of_y: float | None = None) -> tuple:
-    """A curve with x and y in −P/2 … P/2 for a period P each, None without one: it leaves at an edge, and comes in at
-    the other after a gap."""
+    """Wrap x and y to −P/2 … P/2, for the period P of each or None, with a NaN where the curve changes the edge."""
     if of_x is not None:
         x, y = _wrap_angle(x, y, of_x)
     return (x, y) if of_y is None else _wrap_angle(y, x, of_y)[::-1]
@@ -84,7 +83,7 @@ def _wrap_angle(angle: np.ndarray, other: np.ndarray, period: float) -> tuple[np
 
 
 def spans_of(trajectory) -> dict[str, list[tuple[float, float]]]:
-    """The times of one motion in each of its modes, or with each contact closed: pairs (from, to), by name."""
+    """Return {name: [(from, to), …]}: the time intervals of one motion in each mode, or with each contact closed."""
     names = trajectory.mode_names or trajectory.contact_names
     begin, end = (float(np.ravel(x)[0]) for x in (trajectory.ts, trajectory.end.t))
     since, spans = {}, {name: [] for name in names}
@@ -108,13 +107,13 @@ def spans_of(trajectory) -> dict[str, list[tuple[float, float]]]:
 
 
 def courses_of(trajectory, places) -> tuple[Layout, list[Course]]:
-    """The members in these places of a batch, between their outputs; place 0 of one motion is that motion."""
+    """Return the layout and the `Course` of each of the members `places` of a batch; of one motion, place 0."""
     members = Members(trajectory)
     return members.layout, [course_of_member(members, k) for k in places]
 
 
 def course_of(trajectory) -> tuple[Layout, Course]:
-    """One motion between its outputs. Raises `ValueError` for a batch."""
+    """Return the layout and the `Course` of one motion; raise `ValueError` for a batch."""
     members = Members(trajectory)
     if members.batch:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""The equations of a scene to read: M q̈ = F + Gᵀλ with all numbers by the names that the user gave them."""
+"""The equations of a scene as formulas: M q̈ = F + Gᵀλ, with all numbers by the names that the user gave them."""
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -9,7 +9,7 @@ from jaxtyping import PyTree
 from lagjax._equations import derivation_of
 from lagjax._interface import Layout, number_names, show_str
 from lagjax._program import Formulas, Unlowerable
-from lagjax._scene import Driven, drive_scene, held_inputs
+from lagjax._scene import DrivenParams, constant_inputs, drive_scene
 from lagjax._show._formula_text import LATEX, PYTHON, FormulaWriter, Name, input_names, shared_parts, short_names
 
 if TYPE_CHECKING:
@@ -66,11 +66,11 @@ class Equations:
 
 
 def write_equations(system: "System", layout: Layout, params: PyTree, inputs: PyTree) -> Equations:
-    """The result of `System.equations`."""
+    """Return the result of `System.equations`."""
     names = system.constraint_names(layout, params) if system.constraints or system.velocity_constraints else []
     numbers = [*number_names(params, "params"), *number_names(inputs, "inputs")]
     if inputs is not None:
-        system, params = drive_scene(system, held_inputs), Driven(params, inputs)
+        system, params = drive_scene(system, constant_inputs), DrivenParams(params, inputs)
     quantities = ("mass_matrix", "force", "residual", "jacobian", "gamma")
     try:
         derivation = derivation_of(system, layout, params)
@@ -92,7 +92,7 @@ def write_equations(system: "System", layout: Layout, params: PyTree, inputs: Py
 
 
 class _FormulaPage:
-    """The formulas of a scene, and how they are written."""
+    """The formulas of a scene, and their writers for Python and for LaTeX."""
 
     def __init__(self, formulas: Formulas, sums: dict[str, np.ndarray], names: list[Name], constraints: list[str]):
         self.sums, self.names, self.constraints = sums, names, short_names(constraints)

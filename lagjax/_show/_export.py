@@ -1,7 +1,7 @@
-"""A trajectory as labelled arrays (`xarray`) and as a table (`pandas`), both by the names of the user's pytree.
+"""A trajectory as labelled arrays (`xarray`) and as a table (`pandas`), named as in the user's pytree.
 
-Units are given as a pytree prefix of q, as in `jax.vmap`: one for all coordinates, or one for each. Velocities have
-those per unit of time. They stand in the `attrs` of what comes out, and not in the names, by which columns are found.
+Units are given as a pytree prefix of q, as axes in `jax.vmap`: one for all coordinates, or one for each. Velocities
+have those per unit of time. Units are in the `attrs` of the result, not in the names of columns.
 """
 
 import math
@@ -16,7 +16,7 @@ from lagjax._show._summary import import_package, require_numbers
 
 
 def dataset(trajectory, units: PyTree = None, time_unit: str | None = None):
-    """An `xarray.Dataset` of a trajectory: see `Trajectory.to_xarray`."""
+    """Return an `xarray.Dataset` of a trajectory: see `Trajectory.to_xarray`."""
     xarray = import_package("to_xarray()", "xarray", "xarray")
     require_numbers(trajectory, "to_xarray() copies")
     members = _axis_names(np.ndim(trajectory.ok))
@@ -42,7 +42,7 @@ def dataset(trajectory, units: PyTree = None, time_unit: str | None = None):
 
 
 def frame(trajectory, units: PyTree = None, time_unit: str | None = None):
-    """A `pandas.DataFrame` of a trajectory: see `Trajectory.to_pandas`."""
+    """Return a `pandas.DataFrame` of a trajectory: see `Trajectory.to_pandas`."""
     pandas = import_package("to_pandas()", "pandas", "pandas")
     require_numbers(trajectory, "to_pandas() copies")
     members = Members(trajectory)
@@ -68,19 +68,19 @@ def frame(trajectory, units: PyTree = None, time_unit: str | None = None):
 
 
 def impact_frame(impacts):
-    """A `pandas.DataFrame` of `Impacts`: see `Impacts.to_pandas`."""
+    """Return a `pandas.DataFrame` of `Impacts`: see `Impacts.to_pandas`."""
     return _event_frame(impacts, {"impulse": impacts.impulse, "energy_lost": impacts.energy_lost})
 
 
 def change_frame(changes):
-    """A `pandas.DataFrame` of `ContactChanges`: see `ContactChanges.to_pandas`."""
+    """Return a `pandas.DataFrame` of `ContactChanges`: see `ContactChanges.to_pandas`."""
     states = {name: getattr(changes, name) for name in ("q", "qdot", "q_next", "qdot_next")}
     words = {"contact": (changes.contact, changes.names), "change": (changes.change, CHANGE_WORDS)}
     return _event_frame(changes, states, **words)
 
 
 def _event_frame(record, trees: dict[str, PyTree], **words: tuple):
-    """A table of what happened at the times `record.t`, without the rows that pad it; codes are given with `words`."""
+    """Return a table with a row per event at `record.t`, without padding; `words`: (codes, names) of text columns."""
     pandas = import_package("to_pandas()", "pandas", "pandas")
     if not is_known(record.t):
         raise ValueError("to_pandas() copies numbers: call it outside of jit, vmap and grad.")
@@ -99,7 +99,7 @@ def _event_frame(record, trees: dict[str, PyTree], **words: tuple):
 
 
 def columns_of(trees: dict[str, PyTree], lead: int) -> dict[str, np.ndarray]:
-    """Every number of some pytrees as messages name it, along all of the first `lead` axes."""
+    """Return {label: array} for every number in the pytrees, along all of the first `lead` axes."""
     columns = {}
     for name, tree in trees.items():
         for label, leaf in zip(*labelled_leaves(tree, name)[:2], strict=True):
@@ -111,12 +111,12 @@ def columns_of(trees: dict[str, PyTree], lead: int) -> dict[str, np.ndarray]:
 
 
 def _axis_names(rank: int) -> tuple[str, ...]:
-    """Names of the axes of a batch: "member", or "member_0", "member_1", … of batches of batches."""
+    """Return names for the batch axes: "member", or "member_0", "member_1", … for nested batches."""
     return ("member",) if rank == 1 else tuple(f"member_{axis}" for axis in range(rank))
 
 
 def _leaf_units(tree: PyTree, units: PyTree, time_unit: str | None) -> tuple[list, list]:
-    """The unit of every leaf of q, and of its velocity; None where there is none."""
+    """Return the unit of every leaf of q, and of its velocity; None where there is none."""
     if time_unit is not None and not isinstance(time_unit, str):
         raise TypeError(f"time_unit must be text, as 's' is; got {time_unit!r}.")
     of_q = spread_prefix(units, tree, "units", "text")
@@ -128,7 +128,7 @@ def _leaf_units(tree: PyTree, units: PyTree, time_unit: str | None) -> tuple[lis
 
 
 def spread_prefix(prefix: PyTree, tree: PyTree, name: str, what: str) -> list:
-    """The values of a pytree prefix for all leaves of q, None without. Raises `ValueError` where it does not fit."""
+    """Return the value of a pytree prefix for each leaf of q, or None; raise `ValueError` if it does not fit."""
 
     def is_value(x) -> bool:
         return x is None or isinstance(x, str)

@@ -1,7 +1,7 @@
 """Formulas as text, in Python and in LaTeX, in the order of a textbook: m*g*l*sin(theta), positive terms first.
 
-A product is written as numbers, parameters, coordinates, functions, velocities; masses stand first among parameters.
-What has a negative power is written below the line of a fraction.
+The factors of a product are ordered: numbers, parameters (masses first), coordinates, functions, velocities. Factors
+with a negative power become the denominator of a fraction.
 """
 
 import keyword
@@ -25,7 +25,7 @@ _PARAMETER, _COORDINATE, _FUNCTION, _VELOCITY = range(4)
 
 
 class Style(NamedTuple):
-    """The look of a formula: signs of operations, and functions of what is written already."""
+    """A notation, Python or LaTeX: functions that combine the texts of operands."""
 
     times: str
     power: Callable[[str, str], str]
@@ -36,7 +36,7 @@ class Style(NamedTuple):
 
 
 class Name(NamedTuple):
-    """The name of an input in Python and in LaTeX, and the `place` of it in a product."""
+    """The name of an input in Python and in LaTeX, and its `place` in the order of factors."""
 
     text: str
     latex: str
@@ -80,13 +80,13 @@ LATEX = Style(
 
 
 class FormulaWriter:
-    """Sums of `formulas` in a style, with `names` of inputs; `parts` are the atoms that have names of their own."""
+    """Writes sums of `formulas` in a style, with `names` of inputs; `parts` are atoms written by their own name."""
 
     def __init__(self, formulas: Formulas, names: Sequence[Name], style: Style, parts: dict[int, str]):
         self.formulas, self.names, self.style, self.parts = formulas, names, style, parts
 
     def write(self, x: Sum) -> str:
-        """A sum, positive terms first."""
+        """Return the text of a sum, positive terms first."""
         ordered = sorted(x.items(), key=lambda term: (term[1] < 0, self._term_rank(term[0])))
         text = ""
         for product, c in ordered:
@@ -96,7 +96,7 @@ class FormulaWriter:
         return text or "0"
 
     def write_part(self, atom: int) -> str:
-        """The formula that the name of a part stands for."""
+        """Return the formula that the name of a part stands for."""
         of = self.formulas.atoms[atom]
         sums = [self.write(dict(x)) for x in of.operands]
         return sums[0] if of.kind == "sum" else self.style.call(self._function_call(of), sums, "")
@@ -144,7 +144,7 @@ class FormulaWriter:
     # ---- the order of a textbook ----
 
     def _factor_rank(self, atom: int) -> tuple:
-        """The place of a factor in a product."""
+        """Return the sort key of a factor within a product."""
         of = self.formulas.atoms[atom]
         if of.kind == "input":
             name = self.names[of.position]
@@ -159,7 +159,7 @@ class FormulaWriter:
         return max(largest, _FUNCTION), of.kind != "sin", of.kind, atom
 
     def _term_rank(self, product: Product) -> tuple:
-        """The place of a term in a sum, by its factors: those with velocities stand behind others, constants last."""
+        """Return the sort key of a term within a sum: terms with velocities after others, constants last."""
         places = sorted(self._factor_rank(atom) for atom, _ in product)
         return not product, bool(places) and places[-1][0] == _VELOCITY, [str(place) for place in places]
 
@@ -168,7 +168,7 @@ _MASSES = re.compile(r"(m|M|J|I|mass|inertia)[_\d]*")
 
 
 def _number_text(c: float) -> tuple[str, str]:
-    """A positive number above and below the line of a fraction: 0.5, or 1 and 3."""
+    """Return numerator and denominator of a positive number as text: ("0.5", "1"), or ("1", "3")."""
     simple = Fraction(c).limit_denominator(_LARGEST_DENOMINATOR)
     with np.errstate(over="ignore", under="ignore"):
         single = np.float32(c)
@@ -193,7 +193,7 @@ def _exponent_text(power: float, style: Style) -> str:
 
 
 def shared_parts(formulas: Formulas, sums: Iterable[Sum]) -> list[int]:
-    """The atoms that come twice or more and take `LEAST_NAMED` operations or more, the inner ones first."""
+    """Return the atoms that occur at least twice and cost `LEAST_NAMED` operations or more, inner ones first."""
     counts: Counter[int] = Counter()
     waiting = [dict(x) for x in sums]
     while waiting:
@@ -210,7 +210,7 @@ def shared_parts(formulas: Formulas, sums: Iterable[Sum]) -> list[int]:
 
 
 def input_names(coordinates: Sequence[str], numbers: Sequence[str]) -> list[Name]:
-    """The names of q, q̇, t and the parameters, from labels such as q['theta1'] and params['m']."""
+    """Return a `Name` for each of q, q̇, t and the parameters, from labels such as q['theta1'] and params['m']."""
     labels, n = [*coordinates, "t", *numbers], len(coordinates)
     texts = short_names(labels)
     of_rates = {f"{x}_dot" for x in texts[:n]}
@@ -221,14 +221,14 @@ def input_names(coordinates: Sequence[str], numbers: Sequence[str]) -> list[Name
 
 
 def short_names(labels: Sequence[str]) -> list[str]:
-    """Identifiers for labels such as q['theta1'], by their keys where these say which is meant."""
+    """Return identifiers for labels such as q['theta1']: the key alone (theta1) where it is unique."""
     short = [x + "_" * (keyword.iskeyword(x) or x in OPERATIONS or x in _NOT_FINITE) for x in map(_identifier, labels)]
     often = Counter(short)
     return [x if often[x] == 1 else "_".join(re.findall(r"\w+", of)) for x, of in zip(short, labels, strict=True)]
 
 
 def _identifier(label: str) -> str:
-    """q['theta1'] is theta1, q[0] is q0, q['arm'][2] is arm2, q.r is r."""
+    """Return theta1 for q['theta1'], q0 for q[0], arm2 for q['arm'][2], r for q.r."""
     root, *keys = re.findall(r"\w+", label)
     name = ""
     for key in keys:
@@ -243,7 +243,7 @@ _LETTERS = (
 
 
 def latex_name(name: str, dot: bool = False) -> str:
-    r"""theta1 is \theta_{1}, m_cart is m_{\mathrm{cart}}."""
+    r"""Return \theta_{1} for theta1, m_{\mathrm{cart}} for m_cart; with `dot` its time derivative."""
     name = name.rstrip("_")
     base, below = re.fullmatch(r"(.+?)_?(\d*|(?<=_)\w+)", name).groups()  # type: ignore[union-attr]
     if "_" in name.strip("_"):

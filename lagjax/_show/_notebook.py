@@ -1,8 +1,7 @@
-"""The picture of a result in a notebook: its text, and beside it a small picture where matplotlib is installed.
+"""The HTML of a result in a notebook: its text, and a small picture beneath it if matplotlib is installed.
 
-A picture is of a few members and a few hundred outputs, however many there are, so that it takes no longer for a large
-batch. Where there is none to be had, nothing has a value yet or matplotlib is missing, the text is shown alone; a
-notebook must never fail because of its last line.
+A picture shows a few members and a few hundred outputs, however many there are, so that it is as fast for a large
+batch. Without matplotlib, or for traced values, the text is shown alone; the display of a result must not raise.
 """
 
 import base64
@@ -23,7 +22,7 @@ _SIZE, _DPI = (5.2, 1.9), 144  # inches, and the dots of a fine screen
 
 
 def cell(text: str, draw: Callable[[Any], None], size: tuple[float, float] = _SIZE) -> str | None:
-    """HTML of a text with the picture that `draw(figure)` makes beneath it; None where there is no picture."""
+    """Return HTML with a text and the picture that `draw(figure)` makes beneath it; None if drawing fails."""
     try:
         image = render_picture(size, draw)
     except Exception:  # no matplotlib, values that are no numbers, a font that is missing: the text says it all
@@ -35,7 +34,7 @@ def cell(text: str, draw: Callable[[Any], None], size: tuple[float, float] = _SI
 
 
 def render_picture(size: tuple[float, float], draw: Callable[[Any], None], dpi: int = _DPI) -> str:
-    """The picture that `draw(figure)` makes, a PNG in base 64."""
+    """Return the picture that `draw(figure)` makes, as a PNG in base 64."""
     from matplotlib.figure import Figure
 
     figure, file = Figure(figsize=size, dpi=dpi, layout="constrained"), io.BytesIO()
@@ -45,7 +44,7 @@ def render_picture(size: tuple[float, float], draw: Callable[[Any], None], dpi: 
 
 
 def trajectory_html(trajectory) -> str | None:
-    """HTML of a trajectory: its three lines, and coordinates against time; None where nothing can be drawn."""
+    """Return HTML of a trajectory: its summary, and coordinates against time; None for traced values."""
     leaves = [*jax.tree.leaves(trajectory.q), trajectory.ts, trajectory.result._value, trajectory.end.t]
     if not all(map(is_known, leaves)) or not leaves[0].size:
         return None
@@ -71,14 +70,14 @@ def _draw_curves(figure, trajectory) -> None:
 
 
 def draw_curves(ax, curves: list, color: str, label: str | None = None, width: float = 1.2) -> None:
-    """Curves (2, F) of some members in one colour, of which the first has the label."""
+    """Plot curves (2, F) of some members in one colour; the first gets the label."""
     for k, curve in enumerate(curves):
         style = dict(color=color, alpha=max(0.15, len(curves) ** -0.5), linewidth=width)
         ax.plot(*curve, label=None if k else label, **style)
 
 
 def _thin_curve(course: Course) -> tuple[np.ndarray, np.ndarray]:
-    """The times (F,) and coordinates (F, n) of a curve; of many outputs those at some even times."""
+    """Return times (F,) and coordinates (F, n) of a curve; of many outputs only `OUTPUTS` evenly spaced times."""
     if len(course.t) <= OUTPUTS:
         return course.curve()[:2]
     times = np.linspace(course.t[0], course.t[-1], OUTPUTS)
@@ -86,7 +85,7 @@ def _thin_curve(course: Course) -> tuple[np.ndarray, np.ndarray]:
 
 
 def simplify_axes(ax, width: float = 0.8):
-    """The axes with a light grid behind the data, and no box around it."""
+    """Give the axes a light grid behind the data and no box; return them."""
     ax.grid(color="0.9", linewidth=width)
     ax.set_axisbelow(True)
     ax.spines[["top", "right"]].set_visible(False)
@@ -96,5 +95,5 @@ def simplify_axes(ax, width: float = 0.8):
 
 
 def even_places(count: int, most: int) -> np.ndarray:
-    """Places among 0 … count − 1, evenly chosen, `most` of them at most."""
+    """Return at most `most` evenly spaced indices among 0 … count − 1."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))

@@ -1,10 +1,10 @@
-"""A trajectory in three lines: what it holds, over what time and in how many steps, and how it ended.
+"""The three-line summary of a trajectory: its contents, its times and steps, and how it ended.
 
     Trajectory of 1000 members, float64: q['theta'] (1000, 101), q['x'] (1000, 101), and qdot
     t from 0 to 10 at 101 outputs, 241 steps in the median, at most 388 (12 rejected)
     998 of 1000 reached the end, 2 nonfinite_state: the first that failed is member 17, at t = 0.5
 
-Numbers that have no value yet, inside `jax.jit` or `jax.vmap`, are left out. The fields themselves are printed by
+Traced numbers, inside `jax.jit` or `jax.vmap`, are left out. The fields themselves are printed by
 `equinox.tree_pprint(trajectory)`.
 """
 
@@ -22,9 +22,9 @@ LEAVES_SHOWN = 6  # of q, which may have any number of leaves
 
 
 def summary(trajectory) -> str:
-    """The three lines for a `Trajectory`, batched or not, of values, tracers or shapes alone.
+    """Return the three lines for a `Trajectory`, batched or not, of values, tracers or shapes alone.
 
-    For a trajectory that has been mapped to a pytree without arrays in it (axes, filters), its fields.
+    For a trajectory mapped to a pytree without arrays (axes, filters), its fields.
     """
     counts = [trajectory.stats[name] for name in COUNTS]
     essential = trajectory.ts, trajectory.q, trajectory.qdot, trajectory.result, trajectory.end, counts
@@ -35,7 +35,7 @@ def summary(trajectory) -> str:
 
 
 def canonical_summary(trajectory) -> str:
-    """The three lines for a `CanonicalTrajectory`; its fields where it has no shapes."""
+    """Return the three lines for a `CanonicalTrajectory`; its fields if it has no shapes."""
     leaves = jax.tree.leaves((*trajectory,), is_leaf=lambda leaf: leaf is None)
     if not all(hasattr(leaf, "shape") and hasattr(leaf, "dtype") for leaf in leaves):
         return f"CanonicalTrajectory{tuple(trajectory)}"
@@ -50,13 +50,13 @@ def canonical_summary(trajectory) -> str:
 
 
 def require_numbers(trajectory, what: str) -> None:
-    """Raise `ValueError` for a trajectory that is being traced; `what` says who does what with its numbers."""
+    """Raise `ValueError` if a trajectory is traced; `what` begins the message, as in "to_pandas() copies"."""
     if not all(map(is_known, jax.tree.leaves((trajectory.ts, trajectory.q, trajectory.qdot)))):
         raise ValueError(f"{what} numbers: call it outside of jit, vmap and grad.")
 
 
 def import_package(what: str, name: str, source: str, *parts: str) -> Any:
-    """The package `name` with these submodules; raise `ImportError`, with its `source` for pip, where it is missing."""
+    """Import the package `name` and its submodules `parts`; raise `ImportError` naming the pip `source` if missing."""
     try:
         for part in parts:
             importlib.import_module(f"{name}.{part}")
@@ -130,7 +130,7 @@ def _describe_verdict(trajectory) -> str:
 
 
 def _events(trajectory) -> str:
-    """The functions of an event that ended a motion, by name, where there are several."""
+    """Return the names of the event functions that ended the motion, as text; "" for a single function."""
     labels, leaves, _ = labelled_leaves(trajectory.event, "event")
     ended = [label for label, leaf in zip(labels, leaves, strict=True) if is_known(leaf) and bool(leaf)]
     return f", by {', '.join(ended)}" if len(leaves) > 1 and ended else ""

@@ -1,16 +1,19 @@
-"""`sweep`: one scene for many starts and parameters, a few numbers kept of each motion, in a store that is the job.
+"""`sweep`: simulate one scene for many starts and parameters, and store a few numbers of each motion on disk.
+
+The members are divided into units of work. A store (a folder) contains the whole job: the description, the functions,
+and the units that are done; any number of workers compute the others, and readers open it as xarray.
 
 over, q0, keep, … ──► Description, Grid ──► Files ──► units, computed by any number of workers ──► xarray
 
 _members       the points of a sweep: axes, the grid of members, its units (`lagjax.designs` has the rules for axes)
 _statistics    statistics of all members, unit by unit, without a list of their values
-_description   the scene and the user's functions; their text, by which stores are compared; their way to a worker
+_description   the scene and the user's functions; their text, by which stores are compared; how a worker gets them
 _files         the files of a store
 _batch         a batch of members: their motions, the crossings on the way, what is kept of each
 _job           a store with its functions in a process; the computation of a unit
-_begin         stores that are begun; of one that is there, whether its description is the same
-_extend        the part of a new store that another one has: members, or the starts of motions that continue
-_workers       which units are still to be computed, and their computation here or by executors
+_begin         creates a store, or checks that the description of an existing one is the same
+_extend        copies members, or the starts of motions that continue, from another store
+_workers       finds the units that are still to be computed, and computes them here or by executors
 _status        the progress of a store
 """
 
@@ -35,14 +38,7 @@ from lagjax._sweep._job import Job, precision
 from lagjax._sweep._members import axes_of
 from lagjax._sweep._statistics import Statistics, Summary, from_bytes, merge, summary
 from lagjax._sweep._status import Progress, Status, status
-from lagjax._sweep._workers import (
-    require_executor,
-    require_part,
-    run_store,
-    submit,
-    units_to_compute,
-    work,
-)
+from lagjax._sweep._workers import require_executor, require_part, run_store, submit, units_to_compute, work
 
 
 @dataclass(frozen=True)

@@ -22,15 +22,7 @@ from lagjax._engine import Batch, Solution, axes_per_leaf
 from lagjax._engine.taylor import MachineCode, Noted, flow_of, tolerances_of
 from lagjax._equations import has_constraints
 from lagjax._interface import RESULTS, SUCCESSFUL, as_arrays, code_of, name_of, result_from
-from lagjax._run import (
-    Trajectory,
-    restore_crossings,
-    sections_of,
-    simulate,
-    simulate_batch,
-    surfaces_in,
-    trajectory_of,
-)
+from lagjax._run import Trajectory, restore_crossings, sections_of, simulate, simulate_batch, surfaces_in, trajectory_of
 from lagjax._run.hybrid import Hybrid, jumps
 from lagjax._sweep._description import NOT_TRACEABLE, Description, Sections
 from lagjax._sweep._files import RESULT, Quantity

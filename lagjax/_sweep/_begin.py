@@ -1,4 +1,4 @@
-"""Stores that are begun, and those that are there: of these `resume` checks the description."""
+"""`begin` creates a store; `resume` checks the description of an existing one."""
 
 import math
 import time
@@ -24,7 +24,7 @@ _PROBED = 4096  # members by which the time of a member is estimated
 
 
 class _Preview(NamedTuple):
-    """The kept values of a few members, the seconds that one of them takes, and whether the energy is constant."""
+    """The kept values of a few members, the seconds that one takes, and whether the energy is conserved."""
 
     kept: KeptResults
     seconds: float
@@ -32,7 +32,7 @@ class _Preview(NamedTuple):
 
 
 def _preview_members(description: Description, points: dict[str, np.ndarray], compiled: list[Batches]) -> _Preview:
-    """A look at members at these points, or at as many as fit into the memory; what it compiles goes to `compiled`."""
+    """Simulate members at some of these points, as many as fit into memory; append their `Batches` to `compiled`."""
     conserves = False  # resets may do work
     if not isinstance(description.system, Hybrid):
         q, qdot, params = description.evaluate_start({name: x[0] for name, x in points.items()})
@@ -47,7 +47,7 @@ def _preview_members(description: Description, points: dict[str, np.ndarray], co
 
 
 def _thin_points(points: dict[str, np.ndarray], most: int) -> dict[str, np.ndarray]:
-    """Evenly chosen ones of these points: `most` at most, one at least."""
+    """Return at most `most` evenly spaced ones of these points, at least one."""
     return {name: x[:: -(-len(x) // max(1, most))] for name, x in points.items()}
 
 
@@ -59,8 +59,10 @@ def begin(
     compiled: list[Batches],
     other: Files | None,
 ) -> None:
-    """Make the store, after a look at a few members, with what it takes from another; `compiled` gets the look's
-    programs."""
+    """Create the store after a preview of a few members, and copy members from another store.
+
+    The programs that the preview compiled are appended to `compiled`.
+    """
     names, shape = [name for axis in axes for name in axis.names], tuple(axis.size for axis in axes)
     later = None if other is None else later_end_of(other, axes, description)
     if later is not None:
@@ -92,7 +94,7 @@ def begin(
 
 
 def _sample_points(axes: tuple[Axis, ...], later: LaterEnd | None) -> dict[str, np.ndarray]:
-    """Points of some thousand members: evenly spread over the grid; the first ones of designs and continued motions."""
+    """Return points of some thousand members: spread over the grid; the first ones of designs and continued motions."""
     sides, shape = [], []
     for axis in axes:
         _, values = next(axis.pieces())
@@ -107,7 +109,7 @@ def _sample_points(axes: tuple[Axis, ...], later: LaterEnd | None) -> dict[str, 
 
 
 def _choose_unit_size(unit: int | None, shape: tuple[int, ...], seconds: float, quantities: list[Quantity]) -> int:
-    """The members of a unit: the number given, or as many as take `SECONDS` and fit into `UNIT_BYTES`."""
+    """Return the members per unit: `unit`, or as many as take `SECONDS` and fit into `UNIT_BYTES`."""
     if unit is not None:
         if isinstance(unit, bool) or not isinstance(unit, int | np.integer) or unit < 1:
             raise ValueError(f"unit must be a positive whole number of members; got {unit!r}.")
@@ -118,7 +120,7 @@ def _choose_unit_size(unit: int | None, shape: tuple[int, ...], seconds: float, 
 
 
 def _members_in_memory(description: Description, points: dict[str, np.ndarray]) -> int:
-    """The members whose paths, and what is noted on the way, take `PATH_BYTES`; none where one takes more."""
+    """Return how many members' paths and crossings fit into `PATH_BYTES`; 0 if one takes more."""
     first = {name: x[0] for name, x in points.items()}
     q, qdot, _ = description.evaluate_start(first)
     states, sections = 2 * Layout.from_state(q, qdot).size, description.sections
@@ -154,8 +156,7 @@ def _require_names(quantities: list[Quantity], axes: tuple[Axis, ...], reduce: d
 def resume(
     store: Files, spec: dict, axes: tuple[Axis, ...], description: Description, other: Files | None
 ) -> Description:
-    """The description with the names of the store's starts. Raises `ValueError` with the difference where it is
-    another."""
+    """Return the description with the names of the store's starts; raise `ValueError` naming what differs."""
     require_versions(store, spec)
     here = compared_entries(axes, description) | {"continues": None}
     if other is not None and not other.exists():  # all that is needed of it was copied

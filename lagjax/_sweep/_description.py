@@ -1,9 +1,9 @@
-"""`Description`: what a sweep computes for each member; its text, by which stores are compared; its way to workers.
+"""`Description`: what a sweep computes for each member; its text, by which stores are compared; how workers get it.
 
-A worker in another shell gets the functions by cloudpickle: those of the user's script by value, those of modules by
-name, found along the same `sys.path`. Their programs decide whether they still are what the store was begun with, as
-JAX traces them, with every constant: a change of a global number changes those, though not the text of a function. Of
-what JAX does not trace here, `keep` above all, `reads.identity` decides it: the code, and all that it uses.
+A worker in another process gets the functions by cloudpickle: those of the user's script by value, those of modules by
+name, found along the same `sys.path`. Whether they are unchanged since the store was begun is decided by their jaxprs,
+with every constant: a change of a global number changes these, though not the text of a function. For what JAX does not
+trace here, `keep` above all, `reads.identity` decides it: the code, and all that it uses.
 """
 
 import difflib
@@ -39,8 +39,10 @@ _SHOWN = 40  # lines of a difference
 
 
 class Sections(NamedTuple):
-    """The sections to watch: functions of (q, qdot) and, by name, `t` and `params`; how they change; room for each.
-    `names` are those of a dict of sections, None for one function."""
+    """Sections whose crossings are recorded: functions of (q, qdot) and, by name, `t` and `params`; directions.
+
+    `names` are those of a dict of sections, None for one function; `count` is the most crossings recorded.
+    """
 
     names: tuple[str, ...] | None
     functions: tuple[Callable, ...]
@@ -49,7 +51,7 @@ class Sections(NamedTuple):
 
     @classmethod
     def from_arguments(cls, crossings: Any, keep: Callable, settings: dict[str, Any]) -> "Sections | None":
-        """The description given by the arguments of `sweep`. Raises `TypeError` or `ValueError` if wrong."""
+        """Return the sections from the arguments of `sweep`; raise `TypeError` or `ValueError` if wrong."""
         takes_crossings = "crossings" in _parameter_names(keep)
         if crossings is None:
             if takes_crossings:
@@ -95,7 +97,7 @@ class FinalStates(NamedTuple):
 
 @dataclass(frozen=True)
 class Description:
-    """The work for each member: the scene, its start as values or functions of a point, and what is kept."""
+    """The computation of each member: the scene, its start as values or functions of a point, and what is kept."""
 
     system: Scene
     ts: Any  # output times (T,), or a function of a point
@@ -109,16 +111,16 @@ class Description:
     starts: FinalStates | None = None  # of motions that continue those of another store, instead of q0 and qdot0
 
     def evaluate_start(self, point: dict[str, Any]) -> tuple[PyTree, ...]:
-        """(q0, qdot0, params) of the member at a point. Raises `ValueError` where they ask it for another name."""
+        """Return (q0, qdot0, params) of the member at a point; raise `ValueError` if they use an unknown name."""
         return _evaluate_at(point, self.q0, self.qdot0, self.params)
 
     def count_outputs(self, point: dict[str, Any]) -> int:
-        """The number of output times of every member; raises where those of the member at a point are none."""
+        """Return the number of output times of every member; raise if those at this point are invalid."""
         (ts,) = _evaluate_at(point, self.ts)
         return len(output_times(ts, float))
 
     def shapes(self, names: list[str]) -> tuple[PyTree, ...]:
-        """(q0, qdot0, params) of a member whose point has these names: shapes, or numbers that are as good."""
+        """Return shapes of (q0, qdot0, params) for points with these names; values if they cannot be traced."""
         try:
             return jax.eval_shape(self.evaluate_start, {name: jnp.zeros(()) for name in names})
         except NOT_TRACEABLE:
@@ -139,7 +141,7 @@ class Description:
 
 
 def _evaluate_at(point: dict[str, Any], *values) -> tuple[PyTree, ...]:
-    """Values, or those of functions at a point. Raises `ValueError` where they ask it for another name."""
+    """Return the values; of functions, their values at a point. Raise `ValueError` if they use an unknown name."""
     try:
         return tuple(x(point) if callable(x) else x for x in values)
     except KeyError as why:
@@ -158,7 +160,7 @@ def uses_doubles() -> bool:
 
 
 def texts(description: Description, names: list[str]) -> dict[str, dict[str, str]]:
-    """The text of every function and value, and its program as JAX traces it (the text where it cannot)."""
+    """Return the text of every function and value, and its jaxpr as text (its code where JAX cannot trace it)."""
     point = {name: jnp.zeros(()) for name in names}
     q, qdot, params = description.shapes(names)
     entries = {}
@@ -184,7 +186,7 @@ def texts(description: Description, names: list[str]) -> dict[str, dict[str, str
 
 
 def _scene_functions(scene: Scene) -> dict[str, Any]:
-    """The functions of a scene by their roles; of a hybrid one by role and mode, or by role and transition."""
+    """Return the functions of a scene by role; of a hybrid scene by role and mode, or by role and transition."""
     if not isinstance(scene, Hybrid):
         named = {role: getattr(scene, role) for role in ROLES}
     else:
@@ -202,7 +204,7 @@ def _defer_trace(function, arguments: tuple, params) -> Callable:
 
 
 def _entry(value: Any, program: Callable | None, *more: Any) -> dict[str, str]:
-    """The text of a function or a value, and what it computes: as JAX traces it, else its code and all that it uses."""
+    """Return {"text", "program"} of a function or value: the program is its jaxpr, else its code and all it uses."""
     text = source(value) if callable(value) else _value_text(value)
     try:
         closed = program() if program else None
@@ -217,7 +219,7 @@ def _entry(value: Any, program: Callable | None, *more: Any) -> dict[str, str]:
 
 
 def _value_text(value: PyTree) -> str:
-    """A pytree of numbers in words, large arrays by their hash."""
+    """Return a pytree of numbers as text, large arrays by their hash."""
     lines = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(value):
         text = array_text(leaf) if isinstance(leaf, jax.Array | np.ndarray) else strip_addresses(repr(leaf))
@@ -226,7 +228,7 @@ def _value_text(value: PyTree) -> str:
 
 
 def _text_difference(before: dict[str, dict[str, str]], now: dict[str, dict[str, str]]) -> str | None:
-    """The differences between the texts in a store and those of a call, line by line; None where there are none."""
+    """Return the differences between the texts in a store and those of a call, line by line; None if none."""
     parts = []
     for role in dict.fromkeys([*before, *now]):
         old, new = (x.get(role, {"text": "", "program": ""}) for x in (before, now))
@@ -240,14 +242,14 @@ def _text_difference(before: dict[str, dict[str, str]], now: dict[str, dict[str,
 
 
 def compared_entries(axes: tuple[Axis, ...], description: Description) -> dict:
-    """The entries of a store's description that are compared, as JSON keeps them."""
+    """Return the entries of a store's description that are compared, as JSON stores them."""
     names = [name for axis in axes for name in axis.names]
     entries = {"axes": [axis.described() for axis in axes], "x64": uses_doubles(), **description.described()}
     return json.loads(json.dumps(entries | {"scene": texts(description, names)}))
 
 
 def differences(spec: dict, here: dict, entries: Iterable[str], roles: Iterable[str] | None = None) -> list[str]:
-    """The differences between these entries of a store and of a call, in words; of the scene those of some `roles`."""
+    """Return the differences between these entries of a store and of a call, as text; of the scene for some `roles`."""
     lines = []
     for name in entries:
         if name == "scene":
@@ -271,7 +273,7 @@ def pack_description(description: Description) -> bytes:
 
 
 def unpack_description(data: bytes, path: list[str]) -> Description:
-    """The description again, modules of the user found along his `path`. Raises `ImportError` where one is not."""
+    """Unpickle a description, with the user's `path` for modules; raise `ImportError` if one is not found."""
     sys.path += [place for place in path if place not in sys.path]
     try:
         return pickle.loads(data)
@@ -288,7 +290,7 @@ def unpack_description(data: bytes, path: list[str]) -> Description:
 
 
 def users_path() -> list[str]:
-    """The places of `sys.path` that are not Python's own or of installed packages."""
+    """Return the folders of `sys.path` that do not belong to Python or to installed packages."""
     own = {str(Path(sys.prefix).resolve()), str(Path(sys.base_prefix).resolve())}
     places = [str(Path(place or ".").resolve()) for place in sys.path]
     return [place for place in dict.fromkeys(places) if not any(place.startswith(prefix + "/") for prefix in own)]

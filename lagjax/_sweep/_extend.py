@@ -1,8 +1,7 @@
-"""The part of a new store that another one has: members, or the starts of motions that continue.
+"""Copies from another store: members, or last states as the starts of motions that continue.
 
-**Members**: a member is known where all of its coordinates, bit for bit, are those of a member of the other store that
-is done. In a unit of the new store the known members are those of a product of places along each axis. They are copied,
-and not computed.
+**Members**: a member is copied if all of its coordinates, bit for bit, are those of a member of the other store that is
+done. In a unit of the new store these members are those of a product of places along each axis.
 
 **A later end**: the kept values do not determine how a motion continues; its last state does, where `keep` returns
 `trajectory.end` by some name. The new store has the same members, and output times that begin at the last one of the
@@ -83,8 +82,10 @@ def copy_members(old: Files, new: Files) -> None:
 
 
 def _match_places(old: Files, new: Files, old_axis: dict, new_axis: dict) -> Callable[[slice], np.ndarray] | None:
-    """The places in the old store with the values of a part of an axis of the new one; −1 where there is none. None
-    where they have no value in common. Values are read where no one rule gives them."""
+    """Return a function from part of a new axis to the indices in the old store with equal values; −1 for none.
+
+    It is None if no value is in common. Values are read unless both axes have the same rule.
+    """
     if old_axis | {"size": 0} == new_axis | {"size": 0} and old_axis["rule"] in GROWING:
         size = old_axis["size"]
         return lambda part: np.where((places := np.arange(part.start, part.stop)) < size, places, -1)
@@ -105,14 +106,14 @@ def _read_members(old: Files, spec: dict, places: list[np.ndarray]) -> dict[str,
 
 
 class LaterEnd(NamedTuple):
-    """The last states in a store, from which motions continue: their name in it, and the names of their leaves."""
+    """The last states in a store, from which motions continue: their name there, and the names of their leaves."""
 
     store: Files
     end: str
     starts: FinalStates
 
     def read(self, box: tuple[slice, ...]) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """The states (m, …) of the members of a box by name, NaN where they do not continue; and their results (m,)."""
+        """Return the states (m, …) of a box's members by name, NaN if they do not continue; and their results (m,)."""
         names = [*jax.tree.leaves(tuple(self.starts)), RESULT.name]
         *states, result = (np.asarray(self.store.array(name)[box]) for name in names)
         states, result = [x.reshape(-1, *x.shape[len(box) :]) for x in states], result.ravel()
@@ -121,7 +122,7 @@ class LaterEnd(NamedTuple):
         return dict(zip(names[:-1], states, strict=True)), result
 
     def copy(self, new: Files) -> None:
-        """Write the states down as starts of the same members of a new store; members that ended keep their result."""
+        """Write the states as starts of the members of a new store; members that ended keep their result."""
         grid = new.grid(new.spec())
         for unit in range(grid.units):
             states, result = self.read(grid.box(unit))
@@ -135,7 +136,7 @@ def continues(other: Files, description: Description) -> bool:
 
 
 def later_end_of(other: Files, axes: tuple[Axis, ...], description: Description) -> LaterEnd | None:
-    """The last states in a store that these motions continue, None where they do not. Raises where they cannot."""
+    """Return the last states that these motions continue, None if they do not; raise if they cannot."""
     if not continues(other, description):
         return None
     if isinstance(description.system, Hybrid):
@@ -164,7 +165,7 @@ def later_end_of(other: Files, axes: tuple[Axis, ...], description: Description)
 
 
 def start_names(description: Description, names: list[str], end: str) -> FinalStates:
-    """The names of the starts of motions that continue, whose ends another store has by the name `end`."""
+    """Return the names of the starts of continued motions, whose ends another store has by the name `end`."""
     q, qdot, _ = description.shapes(names)
     state = names_of({end: State(jnp.zeros(()), q, qdot)})[end]
     return FinalStates(state.q, state.qdot)

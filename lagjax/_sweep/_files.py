@@ -52,7 +52,7 @@ _REFUSED = (errno.EROFS, errno.EACCES, errno.EPERM)
 
 @dataclass(frozen=True)
 class Quantity:
-    """A kept quantity: its name, shape and type for one member."""
+    """A kept quantity: its name, shape and dtype for one member."""
 
     name: str
     shape: tuple[int, ...]
@@ -64,7 +64,7 @@ class Quantity:
 
     @property
     def filling(self) -> Any:
-        """The number where there is no value: NaN; the least signed or greatest unsigned integer; False."""
+        """The number that stands for a missing value: NaN; the least signed or greatest unsigned integer; False."""
         kind = self.dtype.kind
         if kind in "fc":
             return self.dtype.type(np.nan)
@@ -95,7 +95,7 @@ class Files:
     # ---- the description ----
 
     def spec(self) -> dict:
-        """The description. Raises `FileNotFoundError` or `ValueError` where this is no store that can be read."""
+        """The description. Raises `FileNotFoundError` or `ValueError` if there is no readable store."""
         file = self.job / "spec.json"
         if not self.exists() or not file.exists():
             why = "is no store of a sweep, for it has no .sweep/spec.json: name another folder, or empty this one"
@@ -119,8 +119,10 @@ class Files:
         return spec
 
     def require_arrays(self, spec: dict) -> None:
-        """Raise `ValueError` where what zarr knows of an array, or a coordinate, is not what `create` has written.
-        Links are refused, too: what is written to a store stays in it."""
+        """Raise `ValueError` if the metadata of an array, or a coordinate, differ from what `create` has written.
+
+        Links are refused, too: what is written to a store stays in it.
+        """
         grid, zarr = self.grid(spec), require_zarr()
         sizes = {name: axis["size"] for axis in spec["axes"] for name in axis["names"]}
         wanted: dict = {name: ((n,), (min(n, designs.SLICE),), np.dtype(float)) for name, n in sizes.items()}
@@ -144,7 +146,7 @@ class Files:
                 raise self._damaged_coordinates(axis)
 
     def identity(self) -> str:
-        """The hash of the description and the functions: a store that was made anew is another one."""
+        """Return a hash of the description and the functions, which differs if the store is created anew."""
         return _file_hash((self.job / "spec.json").read_bytes() + self.scene())
 
     def scene(self) -> bytes:
@@ -158,14 +160,16 @@ class Files:
         return [*(q for q in kept if q.name not in spec["reduce"]), RESULT]
 
     def exists(self) -> bool:
-        """True if there is something by this name; an empty folder is nothing."""
+        """True if the path exists and is not an empty folder."""
         with self.explain_errors("no store can be there"):
             return self.path.exists() and not (self.path.is_dir() and not any(self.path.iterdir()))
 
     @contextmanager
     def create_aside(self) -> "Iterator[Files]":
-        """A store in a folder beside this one's, which takes its place when the `with` statement ends. So a store is
-        there when it is whole. Of several processes that make it at once the first one's stays."""
+        """Context with a new store in a folder beside this one, which is renamed to its path at the end.
+
+        So a store is complete once it is there. Of several processes that create it at once the first one's stays.
+        """
         with self.explain_errors("the store was not made"):
             place = self.path.resolve()
             place.parent.mkdir(parents=True, exist_ok=True)
@@ -215,7 +219,7 @@ class Files:
         self.write(self.job / "spec.json", _read_json({"sha256": _file_hash(_read_json(spec)), **spec}))
 
     def coordinates(self, axes: list[dict], box: tuple[slice, ...]) -> list[dict[str, np.ndarray]]:
-        """The values along each axis of a box of members, by names. Raises `ValueError` where they are damaged."""
+        """Return the values along each axis of a box of members, by name; raise `ValueError` if they are damaged."""
         sides = []
         for axis, part in zip(axes, box, strict=True):
             try:
@@ -241,7 +245,7 @@ class Files:
         return (self.job / "done" / f"{unit}.json").exists()
 
     def record(self, unit: int) -> dict:
-        """The notes on a finished unit. Raises `ValueError` where they are not what was written."""
+        """Return the record of a finished unit; raise `ValueError` if it is damaged."""
         record = json.loads((self.job / "done" / f"{unit}.json").read_bytes())
         if not isinstance(record, dict) or not _RECORD_ENTRIES <= set(record):
             raise ValueError("it is no record of a unit")
@@ -264,7 +268,7 @@ class Files:
         self.write(self.job / "copied" / f"{unit}.npz", arrays_as_bytes({"members": copied.members, **arrays}))
 
     def write_unit(self, spec: dict, unit: int, values: dict[str, np.ndarray], record: dict, statistics: bytes) -> None:
-        """Write the chunks of a unit (values (members, …) by name), and then that it is done."""
+        """Write the chunks of a unit (values (members, …) by name), then its record, which marks it as done."""
         grid, hashes = self.grid(spec), {}
         with self.explain_errors(f"unit {unit} was not written"):
             for q in self.quantities(spec):
@@ -277,18 +281,18 @@ class Files:
             self.write(self.job / "done" / f"{unit}.json", json.dumps(record | {"sha256": hashes}).encode())
 
     def chunk_file(self, grid: Grid, unit: int, q: Quantity) -> Path:
-        """The path at which zarr looks for the chunk of a unit."""
+        """Return the path at which zarr looks for the chunk of a unit."""
         return self.path / q.name / "c" / "/".join(map(str, grid.place(unit) + (0,) * len(q.shape)))
 
     def undo(self, spec: dict, unit: int) -> None:
-        """Make a unit one that is still to be done, for those who read `result` too."""
+        """Mark a unit as not done, also for those who read `result`."""
         with self.explain_errors(f"unit {unit} is damaged, and stays so"):
             (self.job / "done" / f"{unit}.json").unlink(missing_ok=True)
             if unit < self.grid(spec).units:
                 self.chunk_file(self.grid(spec), unit, RESULT).unlink(missing_ok=True)
 
     def find_damage(self, spec: dict, units: Iterable[int], whole: bool = False) -> dict[int, str]:
-        """The damage of finished units, in words: files that lack or have another size or, `whole`, hash."""
+        """Return {unit: message} of finished units with files missing or of wrong size or, `whole`, of wrong hash."""
         units, damage = sorted(units), {}
         with ThreadPoolExecutor(_READERS) as readers:
             for k in range(0, len(units), _AHEAD):
@@ -322,7 +326,7 @@ class Files:
     # ---- files ----
 
     def write(self, file: Path, data) -> None:
-        """Write a file aside, have it on the disk, and rename it."""
+        """Write a file under a temporary name, flush it to the disk, and rename it."""
         aside = self.job / "aside" / f"{os.getpid()}-{os.urandom(4).hex()}-{file.name}"
         try:
             write_through(aside, data)
@@ -333,7 +337,7 @@ class Files:
                 aside.unlink(missing_ok=True)
 
     def require_writable(self) -> None:
-        """Raise `OSError`, with a sentence, where nothing can be written here; remove what dead workers have left."""
+        """Raise `OSError`, with a message, if nothing can be written here; remove files that dead workers left."""
         with self.explain_errors("nothing was computed"):
             probe = self.job / "aside" / f"probe-{os.getpid()}-{os.urandom(4).hex()}"
             self.write(probe, b"")
@@ -346,7 +350,7 @@ class Files:
 
     @contextmanager
     def explain_errors(self, what: str) -> Iterator[None]:
-        """A context in which an error of the disk is raised again as a sentence; `what` it cost."""
+        """Context that raises errors of the disk again with a message; `what` says what was lost."""
         try:
             yield
         except OSError as error:
@@ -363,12 +367,12 @@ class Files:
 
 
 def is_file_name(name: Any) -> bool:
-    """True for the name of an array, which is that of a folder of the store."""
+    """True if a name can be that of an array, which is a folder of the store."""
     return isinstance(name, str) and bool(name) and not set(name) & set("/\\\0") and name[0] != "."
 
 
 def _encode_chunk(grid: Grid, unit: int, q: Quantity, values: np.ndarray) -> bytes:
-    """A chunk as zarr writes it: the values of a box in their place, what lies beyond the grid filled; the checksum."""
+    """Return a chunk in zarr's format: the values of a box, filling beyond the grid, and the checksum."""
     import google_crc32c  # which zarr's codec takes it from
 
     whole = np.full(grid.chunk + q.shape, NOT_DONE if q == RESULT else q.filling, q.dtype.newbyteorder("<"))

@@ -1,7 +1,7 @@
-"""`Job`: a store with the functions that belong to it, in a process that is to compute; `compute`: one of its units.
+"""`Job`: a store with its functions loaded, in a process that computes; `compute`: the computation of one unit.
 
-The batches of a unit follow from its size alone, all of one size; the last is filled up with copies of its last
-member, which are thrown away. So a member stands at the same place of the same batch whoever computes it.
+The batches of a unit follow from its size alone, all of one size; the last is filled up with copies of its last member,
+which are thrown away. So a member has the same index in the same batch whoever computes it.
 """
 
 import math
@@ -40,7 +40,7 @@ class Job:
 
     @classmethod
     def from_store(cls, store: Files, spec: dict, description: Description, batches: Batches | None = None) -> "Job":
-        """The job of a store whose functions are at hand; `batches` may have been compiled for them."""
+        """Return the job of a store with its functions; `batches` may have been compiled for them."""
         if spec.get("cpu", cpu()) != cpu():
             warnings.warn(
                 f"{store.path} was begun on a CPU of the kind {spec['cpu']}, and continues here on {cpu()}: members "
@@ -61,8 +61,10 @@ class Job:
 
 @contextmanager
 def precision(doubles: bool) -> Iterator[None]:
-    """Compute in the precision of the store, in this thread and in those of XLA, which calls callbacks of `keep` from
-    threads that see the setting of the process. Of several stores in one process the first decides on it."""
+    """Context that sets 64- or 32-bit floats as in the store, for this thread and those in which XLA calls back `keep`.
+
+    Those see the setting of the process. Of several stores in one process the first determines it.
+    """
     with _precision_lock:
         _doubles_before.append(_doubles_in_process())
         if len(_doubles_before) == 1:
@@ -82,7 +84,7 @@ _doubles_before: list[bool] = []  # of all who are inside, whether the process h
 
 
 def _doubles_in_process() -> bool:
-    """True if this process computes in doubles, whatever this thread has chosen: as a thread sees it that has not."""
+    """True if JAX's default precision of this process is 64 bits, as seen by a thread without own setting."""
     with ThreadPoolExecutor(1) as thread:
         return thread.submit(uses_doubles).result()
 
@@ -93,7 +95,7 @@ def _set_doubles_in_process(doubles: bool) -> None:
 
 
 def open_job(path: str) -> Job:
-    """The job of a store known by its path, opened once for each content. Raises where it is not what was begun."""
+    """Return the job of the store at a path, cached by content; raise if it is not what was begun."""
     return _open_job(path, Files(Path(path)).identity())
 
 
@@ -112,18 +114,18 @@ def _open_job(path: str, content: str) -> Job:
 
 @lru_cache(maxsize=1)
 def cpu() -> str:
-    """The kind of the CPU, on which the last bits depend as well: by the width of its vectors, and what it fuses."""
+    """Return the kind of the CPU, on which the last bits depend: by its vector width and fused operations."""
     return f"{llvm.get_host_cpu_name()} ({platform.machine()})"
 
 
 def versions() -> dict[str, str]:
-    """The versions that the bits of a store depend on, and that of Python, whose code travels."""
+    """Return the versions of packages on which the bits of a store depend, and of Python, for pickled code."""
     of_packages = {name: metadata.version(name) for name in ("jax", "jaxlib", "diffrax", "numpy")}
     return {"lagjax": VERSION, "python": ".".join(platform.python_version_tuple()[:2]), **of_packages}
 
 
 def require_versions(store: Files, spec: dict) -> None:
-    """Raise `ValueError` where this process would compute other bits, or cannot read the functions."""
+    """Raise `ValueError` if this process would compute other bits, or cannot load the functions."""
     here = versions()
     other = [f"{name} {was}, here {here[name]}" for name, was in spec["versions"].items() if here.get(name) != was]
     if other:
@@ -139,7 +141,7 @@ _NAMED = 100  # failures of a unit that are named in its record; the array `resu
 
 
 class Unit(NamedTuple):
-    """A unit that was computed: values (m, …) by name, what is noted of it, and its statistics as bytes."""
+    """A computed unit: values (m, …) by name, its record, and its statistics as bytes."""
 
     values: dict[str, np.ndarray]
     record: dict
@@ -147,7 +149,7 @@ class Unit(NamedTuple):
 
 
 def parts(job: Job, unit: int) -> list[tuple[np.ndarray, int]]:
-    """The batches of a unit: its members in each, all of one length, and how many of them are not copies."""
+    """Return the batches of a unit: the members in each, all of one length, and how many are not copies."""
     members = np.setdiff1d(np.arange(job.grid.size(unit)), job.store.copied(unit).members)
     if not members.size:
         return []
@@ -193,7 +195,7 @@ def compute(job: Job, unit: int) -> Unit:
 
 
 def record_of(grid: Grid, unit: int, result: np.ndarray, engine: str, complaints: dict[int, str]) -> dict:
-    """The record of a unit: its `result`s (m,) counted by name, and the first members that failed, with complaints."""
+    """Return the record of a unit: its `result`s (m,) counted by name, and the first failed members."""
     codes, failed = np.unique(result, return_counts=True), np.flatnonzero(~np.isin(result, ENDED_WELL))[:_NAMED]
     results = {label(int(code)): int(count) for code, count in zip(*codes, strict=True)}
     rows = zip(grid.numbers(unit, failed), result[failed], failed, strict=True)

@@ -1,8 +1,8 @@
-"""The members of a sweep: the product of the axes of `over`, its points, and how units tile it.
+"""The members of a sweep: the product of the axes of `over`, its points, and its division into units.
 
     over ──axes_of──► Axis, … ──► Grid: shape, units ──► the range of a unit ──► points of some of its members
 
-A member is a place in the grid; its number counts in the order of C, the last axis fastest. A unit is a box of members
+A member is an index into the grid; its number counts in C order, the last axis fastest. A unit is a box of members
 without gaps in that order, and one chunk of every array in the store.
 """
 
@@ -21,7 +21,7 @@ RESERVED = ("result",)
 
 @dataclass(frozen=True)
 class Axis:
-    """One axis: the names that vary along it together, and their values (size, names), or the rule for them."""
+    """One axis: the names that vary along it together, and their values (size, names), or a `Design` for them."""
 
     names: tuple[str, ...]
     size: int
@@ -32,7 +32,7 @@ class Axis:
         return "_".join(self.names)
 
     def pieces(self) -> Iterator[tuple[int, np.ndarray]]:
-        """(start, values (m, names)), one after the other."""
+        """Yield (start, values (m, names)) in order."""
         start = 0
         for values in self.source.pieces(self.names) if isinstance(self.source, Design) else [np.stack(self.source, 1)]:
             yield start, values
@@ -51,7 +51,7 @@ def hash_columns(columns) -> str:
 
 
 def describe_axes(axes: list[dict]) -> str:
-    """The axes that a store describes, for a sentence: 'length: 6 values from 0.5 to 1.5 (#53dd0e), …'."""
+    """Return the axes in a store's description as text: 'length: 6 values from 0.5 to 1.5 (#53dd0e), …'."""
     return "; ".join(f"{', '.join(axis['names'])}: {_describe_values(axis)}" for axis in axes)
 
 
@@ -63,7 +63,7 @@ def _describe_values(axis: dict) -> str:
 
 
 def axes_of(over: Any) -> tuple[Axis, ...]:
-    """The axes of `over`. Raises `TypeError` or `ValueError`, with a sentence, where it is no description."""
+    """Return the axes of `over`; raise `TypeError` or `ValueError` if it is invalid."""
     if not isinstance(over, dict) or not over:
         raise TypeError(
             "over must be a dict that is not empty: names with 1-D arrays or designs, as in {'l': np.linspace(1, 2, "
@@ -113,14 +113,14 @@ def _member_column(name: str, value: Any) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Grid:
-    """The shape of all members and of the chunk that is a unit's."""
+    """The shape of all members, and that of a unit, which is a chunk of each array."""
 
     shape: tuple[int, ...]
     chunk: tuple[int, ...]
 
     @classmethod
     def from_shape(cls, shape: tuple[int, ...], members: int) -> "Grid":
-        """The members in units of about this size: whole last axes, a part of one, single places of those before it."""
+        """Divide the members into units of about this size: whole last axes, part of one, single indices before."""
         chunk, room = [1] * len(shape), max(1, members)
         for place in reversed(range(len(shape))):
             chunk[place] = min(shape[place], room)
@@ -143,7 +143,7 @@ class Grid:
         return math.prod(self.tiles)
 
     def place(self, unit: int) -> tuple[int, ...]:
-        """The place of a unit among the units; the name of its chunk."""
+        """Return the index of a unit among the units, which names its chunk."""
         return tuple(int(i) for i in np.unravel_index(unit, self.tiles))
 
     def box(self, unit: int) -> tuple[slice, ...]:
@@ -157,18 +157,18 @@ class Grid:
         return math.prod(self.box_shape(unit))
 
     def numbers(self, unit: int, which: np.ndarray) -> np.ndarray:
-        """The numbers in the whole sweep of members of a unit, `which` counts inside of it."""
+        """Return the numbers in the whole sweep of the members `which` of a unit."""
         inside = np.unravel_index(which, self.box_shape(unit))
         places = [i + s.start for i, s in zip(inside, self.box(unit), strict=True)]
         return np.asarray(np.ravel_multi_index(places, self.shape))
 
 
 def points_of(axes: list[dict[str, np.ndarray]], shape: tuple[int, ...], which: np.ndarray) -> dict[str, np.ndarray]:
-    """The points of members of a box of this `shape`: `axes` holds the values along each axis, by names."""
+    """Return the points of members of a box of this `shape`: `axes` has the values along each axis, by name."""
     places = np.unravel_index(which, shape)
     return {name: values[i] for i, axis in zip(places, axes, strict=True) for name, values in axis.items()}
 
 
 def text_of(point: dict[str, Any]) -> str:
-    """A point in words: 'l = 0.5, theta = 1.2'; all digits, so that it can be run again."""
+    """Return a point as text, 'l = 0.5, theta = 1.2', with all digits, so that it can be run again."""
     return ", ".join(f"{name} = {float(value)!r}" for name, value in point.items())

@@ -1,10 +1,10 @@
-"""`Statistics`: moments, extremes, histograms and quantiles of a quantity over all members, without a list of them.
+"""`Statistics`: moments, extremes, histograms and quantiles of a quantity over all members, in bounded memory.
 
-Each unit has one `Partial`, which stands in the store; they are merged in the order of the units, so that the bits of
-the result do not depend on who computed what, and when. Counts, histograms and quantiles are whole numbers; mean and
-variance are merged as Chan, Golub & LeVeque do (*Algorithms for computing the sample variance*, Am. Stat. 37 (1983)
-242). Quantiles are read off a histogram in log|x|, whose bins are `RELATIVE` wide: DDSketch (Masson, Rim & Lee,
-*DDSketch: a fast and fully-mergeable quantile sketch*, VLDB 12 (2019) 2195).
+Each unit has one `Partial`, stored with it; they are merged in the order of the units, so that the bits of the result
+do not depend on who computed what, and when. Counts, histograms and quantiles are whole numbers; mean and variance are
+merged as Chan, Golub & LeVeque do (*Algorithms for computing the sample variance*, Am. Stat. 37 (1983) 242). Quantiles
+are read off a histogram in log|x|, whose bins are `RELATIVE` wide: DDSketch (Masson, Rim & Lee, *DDSketch: a fast and
+fully-mergeable quantile sketch*, VLDB 12 (2019) 2195).
 """
 
 import io
@@ -97,7 +97,7 @@ class Summary(NamedTuple):
 
 
 def partial_of(how: Statistics, values: np.ndarray, ok: np.ndarray, members: np.ndarray) -> Partial:
-    """The statistics of a unit: `values` (m, …) of its members, whether they ended well, and their numbers (m,)."""
+    """Return the statistics of a unit: `values` (m, …) of its members, `ok` of each, and their numbers (m,)."""
     columns = np.ascontiguousarray(values.reshape(len(values), -1).astype(float).T)
     rows = [_summarize_column(how, c, x, ok & np.isfinite(x), members) for c, x in enumerate(columns)]
     *fields, sketches = zip(*rows, strict=True)
@@ -121,20 +121,20 @@ def _summarize_column(how: Statistics, c: int, x: np.ndarray, use: np.ndarray, m
 
 
 def _bin_indices(x: np.ndarray) -> np.ndarray:
-    """The bins of numbers, in increasing order of these; 0 is zero's."""
+    """Return the bin of each number, increasing with it; 0 for zero."""
     with np.errstate(divide="ignore"):
         size = np.ceil(np.log(np.abs(x)) / _LOG_GAMMA)
     return np.where(x == 0, 0, np.sign(x) * (np.where(x == 0, 0.0, size) + _OFFSET)).astype(np.int64)
 
 
 def _bin_centres(bins: np.ndarray) -> np.ndarray:
-    """The numbers at most `RELATIVE` from all that are in these bins."""
+    """Return the centre of each bin, within `RELATIVE` of all numbers in it."""
     size = np.exp((np.abs(bins) - _OFFSET) * _LOG_GAMMA) * 2 / (1 + np.exp(_LOG_GAMMA))
     return np.where(bins == 0, 0.0, np.sign(bins) * size)
 
 
 def merge(one: Partial | None, two: Partial) -> Partial:
-    """The statistics of two sets of members, those of `one` before those of `two`."""
+    """Merge the statistics of two sets of members, those of `one` before those of `two`."""
     if one is None:
         return two
     count, step = one.count + two.count, two.mean - one.mean

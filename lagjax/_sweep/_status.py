@@ -115,7 +115,7 @@ def point(store: Files, spec: dict, member: int) -> dict[str, float]:
 
 
 def _members_per_second(store: Files, done: list[int], records: list[dict]) -> float | None:
-    """Members per second, from the times of the last files; the disk's clock is one for all workers."""
+    """Return members per second, from the times of the last files on the disk, whose clock all workers share."""
     if not records:
         return None
     times = [(store.job / "done" / f"{unit}.json").stat().st_mtime for unit in done]
@@ -134,7 +134,7 @@ def duration(seconds: float) -> str:
 
 
 class Progress:
-    """A line on stderr that is written again and again: done, rate, what failed, what is left."""
+    """Prints the progress on one line of stderr, over and over: done, rate, failures, time left."""
 
     def __init__(self, store: Files, spec: dict, shown: bool):
         self.store, self.shown, self.members = store, shown, store.grid(spec).members

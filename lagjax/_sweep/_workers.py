@@ -1,11 +1,11 @@
-"""Workers: whoever computes a unit writes it, and the bits are the same.
+"""Computes units by workers: any of them may compute a unit, with the same bits.
 
 this process   units one after the other, on all cores
 executors      a task is one unit by its number; the process that gets it opens the store by its path
 
-Who computes a unit is settled before: an executor hands units out, and each task of an array has its `part` of them. A
-unit that two compute by mistake is written twice with the same bits; one whose process has died is not done, and the
-next run computes it. So no worker has to know of another, and the disk needs no locks.
+An executor assigns units to processes, and each task of an array has its `part` of them. A unit that two compute by
+mistake is written twice with the same bits; one whose process has died is not done, and the next run computes it. So no
+worker has to know of another, and the disk needs no locks.
 """
 
 import operator
@@ -27,7 +27,7 @@ Notify = Callable[[], None]
 
 
 def require_part(part: Any) -> slice:
-    """Part k of n, every n-th unit from the k-th on. Raises `ValueError` where this is none."""
+    """Return part k of n, every n-th unit from the k-th on, as a slice; raise `ValueError` if invalid."""
     try:
         k, count = map(operator.index, part)
     except (TypeError, ValueError):
@@ -38,8 +38,10 @@ def require_part(part: Any) -> slice:
 
 
 def units_to_compute(job: Job, part: slice) -> list[int]:
-    """The units of a part that are not done, or damaged. Raises `OSError` where some are and nothing can be written: a
-    finished store may lie on a read-only disk."""
+    """Return the units of a part that are not done, or damaged; raise `OSError` if the store cannot be written.
+
+    A finished store may be on a read-only disk.
+    """
     store, chosen = job.store, set(range(job.grid.units)[part])
     store.require_arrays(job.spec)
     finished = {unit for unit in store.finished_units() if unit in chosen or unit >= job.grid.units}
@@ -57,7 +59,7 @@ def units_to_compute(job: Job, part: slice) -> list[int]:
 
 
 def work(job: Job, units: list[int], notify: Notify = lambda: None) -> int:
-    """Compute and write these units in this process; return the number of those that no other had done by then."""
+    """Compute and write these units in this process; return how many were not already done by another."""
     count = 0
     with precision(bool(job.spec["x64"])):
         for unit in units:
@@ -69,7 +71,7 @@ def work(job: Job, units: list[int], notify: Notify = lambda: None) -> int:
 
 
 def run_store(store: Files, notify: Notify = lambda: None, most: int | None = None, part: Any = (0, 1)) -> int:
-    """Compute units of a store that is known by its path alone, `most` at most; return their number."""
+    """Compute at most `most` units of the store at a path; return their number."""
     chosen = require_part(part)
     job = open_job(str(store.path.resolve()))
     return work(job, units_to_compute(job, chosen)[:most], notify)
@@ -83,7 +85,7 @@ _POLL = 0.2  # seconds between two looks at tasks that are no futures
 
 
 def submit(job: Job, units: list[int], executor: Any, notify: Notify) -> None:
-    """Compute these units by an executor. Raises what a task raises, `RuntimeError` where a worker has died."""
+    """Compute these units by an executor; raise what a task raises, `RuntimeError` if a worker has died."""
     path, remaining, running = str(job.store.path.resolve()), iter(units), set()
     try:
         while True:
@@ -116,7 +118,7 @@ def run_unit(path: str, unit: int) -> None:
 
 
 def _wait_for_first(running: set[Any]) -> set[Any]:
-    """The tasks that are done, one at least; tasks that are no futures, as those of submitit, are polled."""
+    """Wait until a task is done; return all that are. Tasks that are no futures, as submitit's, are polled."""
     if all(isinstance(task, Future) for task in running):
         return wait(running, return_when=FIRST_COMPLETED).done
     while not (finished := {task for task in running if task.done()}):

@@ -53,7 +53,7 @@ from lagjax._program import (
     table_of,
 )
 from lagjax._tracing import _scalars as scalar_algebra
-from lagjax._tracing._emit import Rows, apply_in_jax, emit, emit_look_up, emit_rows
+from lagjax._tracing._emit import WRITTEN, Rows, apply_in_jax, emit, emit_look_up, emit_rows
 from lagjax._tracing._scalars import Scalars, absolute, apply_function, concatenate, fold, multiply, scatter, stack
 from lagjax._tracing.lowering import _complex
 from lagjax._tracing.lowering._matrices import orthogonalize, row_weights, solve_orthogonalized

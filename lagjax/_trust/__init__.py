@@ -1,7 +1,7 @@
-"""Trust: faults of a scene before it moves, the reason why a motion failed, and the error of one that did not.
+"""Checks of results: faults of a scene before integration, the reason of a failed motion, and the error of others.
 
-`checks/` looks at a scene before it moves, `health/` at a trajectory; `_diagnosis` says what a failed motion ran into,
-with the line of code; `_precision` holds `work_precision`: what a digit costs.
+`checks/` examines a scene at a state, `health/` a trajectory; `_diagnosis` explains a failed motion, with the line of
+code; `_precision` has `work_precision`: run time against accuracy.
 """
 
 from lagjax._trust._diagnosis import describe_failure

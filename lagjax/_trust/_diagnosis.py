@@ -1,11 +1,11 @@
-"""The obstacle of a failed motion, in words: `diagnosis`, from the state where it ended and the one where it began.
+"""`diagnosis`: sentences on why a motion failed, from its first and its last state.
 
-`_stop_reason` gives a failure its code, from numbers alone and for every member of a batch. Here the author of the
-scene is told about one motion: which force is not finite and from when on, the operation and the line of code that it
-comes from, a pole that was reached, a mass matrix that has become singular, an escape to infinity, and what `check`
-finds at the last state: a kink, a jump, stiff terms.
+`_stop_reason` gives a failure its code, from numbers alone and for every member of a batch. Here one motion is
+explained to the author of the scene: which force is not finite and from when on, the operation and the line of code
+that it comes from, a pole that was reached, a mass matrix that has become singular, an escape to infinity, and what
+`check` finds at the last state: a kink, a jump, stiff terms.
 
-All but the line and `check` is read off the scene's programs in NumPy, which compiles nothing. These two have limits,
+All but the line and `check` uses the scene's scalar programs in NumPy, which compiles nothing. These two have limits,
 `LONGEST_FUNCTION` and `LARGEST_CHECKED`: a failure must not cost more than a motion does.
 """
 
@@ -37,7 +37,7 @@ from lagjax._interface import RESULTS, Layout, code_of, halves, join_names, not_
 from lagjax._primitives import sentence
 from lagjax._program import MOST_COUPLED, Unlowerable
 from lagjax._run import Trajectory
-from lagjax._scene import Flat, System
+from lagjax._scene import FlatContacts, System
 from lagjax._trust.checks import check, describe_direction
 
 LONGEST_FUNCTION = 4000  # equations of a function up to which they are gone through one by one: some 50 µs each
@@ -70,8 +70,8 @@ _AT_CORNER = (
 )
 
 
-class Ended(NamedTuple):
-    """Beginning and end of one motion, in NumPy: `y` (2n,) at `t`, of `t_first` … `t_last`; `numbers` in params."""
+class MotionEnd(NamedTuple):
+    """The first and the last state of one motion, in NumPy: `y` (2n,) at `t`, of times `t_first` … `t_last`."""
 
     code: int
     t: float
@@ -85,12 +85,12 @@ class Ended(NamedTuple):
     scene: tuple | None = None  # a large scene and its parameters, which XLA evaluates
 
     def sample(self, derivation: Derivation, y: np.ndarray, t) -> Sample:
-        """The scene at other states y (S, 2n)."""
+        """Return a `Sample` of the scene at states y (S, 2n) and times t, with this motion's parameters."""
         return Sample.from_states(derivation, y, t, self.numbers)._replace(scene=self.scene)
 
 
 def describe_failure(trajectory: Trajectory, layout: Layout, why: str | None) -> str:
-    """The whole message of a single motion that failed: why it did, its last state and the diagnosis."""
+    """Return the whole message of a single motion that failed: its result code, last state and diagnosis."""
     end, system = trajectory.end, trajectory.system
     y_end = np.concatenate([layout.flatten(end.q), layout.flatten(end.qdot)])
     message = sentence(trajectory.result._value, end.t, trajectory.ts[-1], y_end, layout.names, why) or ""
@@ -113,8 +113,8 @@ def describe_failure(trajectory: Trajectory, layout: Layout, why: str | None) ->
     return message + diagnosis(system, layout, params, ended)
 
 
-def diagnosis(system: System, layout: Layout, params, ended: Ended) -> str:
-    """The facts about a failure, as sentences on a line of their own that begins with a line break; or nothing."""
+def diagnosis(system: System, layout: Layout, params, ended: MotionEnd) -> str:
+    """Return what is known about a failure, as text that begins with a line break; "" if nothing is."""
     try:
         undefined, closed = _describe_gaps(system, layout, params, ended)
         if undefined or ended.code not in _CODES:
@@ -124,7 +124,7 @@ def diagnosis(system: System, layout: Layout, params, ended: Ended) -> str:
         return f"\n(No more is known about it: {type(error).__name__}.)"
 
 
-def _find_cause(system: System, layout: Layout, params, ended: Ended) -> str:
+def _find_cause(system: System, layout: Layout, params, ended: MotionEnd) -> str:
     derivation = derivation_of(system, layout, params)
     if derivation.form.is_sparse:
         ended = ended._replace(scene=(system, params))
@@ -143,8 +143,8 @@ def _find_cause(system: System, layout: Layout, params, ended: Ended) -> str:
     return f"\n{text}" if text else _run_check(system, derivation, params, ended) or _budget_end(ended)
 
 
-def _describe_gaps(system: System, layout: Layout, params, ended: Ended) -> tuple[str, str]:
-    """A line about the first gap or one-way velocity that is not finite where the motion ended; one of what touches."""
+def _describe_gaps(system: System, layout: Layout, params, ended: MotionEnd) -> tuple[str, str]:
+    """Return a sentence on the first gap or one-way velocity that is not finite at the end; one on closed contacts."""
     if not system.touches or not np.isfinite(ended.y).all():
         return "", ""
     q, qdot = map(layout.restore, halves(ended.y))
@@ -164,7 +164,7 @@ def _describe_gaps(system: System, layout: Layout, params, ended: Ended) -> tupl
     return "", f"\nIn touch there: {join_names(touching)}, whose gaps and slips may have corners as L has{law}."
 
 
-def _reset_to_nothing(layout: Layout, ended: Ended) -> str:
+def _reset_to_nothing(layout: Layout, ended: MotionEnd) -> str:
     names = [*layout.names, *(f"the velocity of {name}" for name in layout.names)]
     bad = [f"{name} ({value})" for name, value in zip(names, ended.y, strict=True) if not np.isfinite(value)]
     return f"The reset of the transition at t = {ended.t:.9g} returned {join_names(bad)}: every number must be finite."
@@ -185,8 +185,8 @@ _QUANTITIES = (
 _OF_LARGE = {"mass_matrix": "mass_by_some", "jacobian": "jacobian_columns"}  # sums over the rows, or columns
 
 
-def _states_ahead(ended: Ended, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """States (S, 2n) and times (S,): at the end, some smallest steps on along the motion, and then in time alone."""
+def _states_ahead(ended: MotionEnd, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return states (S, 2n) and times (S,): the last, some a few round-offs later, and some with only t advanced."""
     smallest = 4 * np.finfo(ended.y.dtype).eps * max(abs(ended.t_first), abs(ended.t_last))
     steps = np.array([0.0, *AHEAD]) * np.copysign(smallest, ended.t_last - ended.t_first)
     moved = ended.y + steps[:, None] * np.where(np.isfinite(rate), rate, 0.0)
@@ -195,8 +195,8 @@ def _states_ahead(ended: Ended, rate: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 @np.errstate(all="ignore")
-def _quantities_ahead(derivation: Derivation, numbers, ended: Ended) -> tuple[np.ndarray, np.ndarray, dict]:
-    """States, times and the scene's quantities there; without programs, forces and the gradient of L by JAX."""
+def _quantities_ahead(derivation: Derivation, numbers, ended: MotionEnd) -> tuple[np.ndarray, np.ndarray, dict]:
+    """Return states, times and quantities there by name; without scalar programs, only forces and ∂L/∂q, by JAX."""
     (_, v), motion, values = halves(ended.y), derivation.motion, {}
     try:
         y, t = _states_ahead(ended, np.concatenate([v, _end_acceleration(derivation, ended)]))
@@ -213,8 +213,8 @@ def _quantities_ahead(derivation: Derivation, numbers, ended: Ended) -> tuple[np
     return y, t, values
 
 
-def _describe_undefined(system: System, derivation: Derivation, params, ended: Ended) -> str:
-    """A sentence about the first of the scene's quantities that is not finite at the end or just ahead; or nothing."""
+def _describe_undefined(system: System, derivation: Derivation, params, ended: MotionEnd) -> str:
+    """Return a sentence on the first quantity that is not finite at the end or just after it; "" if none is."""
     numbers, along = eqx.filter(params, eqx.is_array_like), 1 + len(AHEAD)
     y, t, values = _quantities_ahead(derivation, numbers, ended)
     for row in range(along):
@@ -234,7 +234,7 @@ def _describe_undefined(system: System, derivation: Derivation, params, ended: E
 
 
 def _blame_operation(motion: Motion, role: str, arguments: tuple) -> str:
-    """The operation to blame of one of the scene's functions, and its line, as the end of a sentence."""
+    """Return ". It comes from …": the operation and line that are not finite in a function of the scene; or ""."""
     function, on = getattr(motion, role), motion.constraints.on_positions
     if role == "constraints":
         function = on and (lambda q, qdot, t, params: on(q, t, params))
@@ -246,8 +246,8 @@ def _blame_operation(motion: Motion, role: str, arguments: tuple) -> str:
     return f". It comes from {to_blame[0]}" if to_blame else ""
 
 
-def _short_functions(system: System, layout: Layout, params, ended: Ended) -> tuple[list[Callable], tuple]:
-    """The forces and L, as far as the scene has them and they can be gone through; and their arguments at the end."""
+def _short_functions(system: System, layout: Layout, params, ended: MotionEnd) -> tuple[list[Callable], tuple]:
+    """Return the forces and L, those given and at most `LONGEST_FUNCTION` long, and their arguments at the end."""
     # The functions of this very system: its derivation may be that of another one, whose text stands in another line.
     motion = system._motion(layout, params)
     arguments = *halves(ended.y), ended.t, eqx.filter(params, eqx.is_array_like)
@@ -270,8 +270,8 @@ def _equations_at_end(jaxpr) -> int:
 
 
 @np.errstate(all="ignore")
-def _describe_singular_mass(derivation: Derivation, ended: Ended) -> str:
-    """A sentence where an eigenvalue of M has come down to next to nothing on the way."""
+def _describe_singular_mass(derivation: Derivation, ended: MotionEnd) -> str:
+    """Return a sentence if an eigenvalue of M has become almost zero between the first and the last state."""
     if derivation.motion.constrained:  # which may hold what L does not
         return ""
     try:
@@ -303,7 +303,7 @@ def _describe_singular_mass(derivation: Derivation, ended: Ended) -> str:
 
 
 def _describe_null(unused: list[str], directions, names: tuple[str, ...]) -> str:
-    """The coordinates, or their combinations, that carry no kinetic energy."""
+    """Return a sentence on the coordinates, or their combinations, that carry no kinetic energy."""
     if unused:
         return (
             f"Singular there: L has no kinetic energy in the velocity of {join_names(unused)} (absent from L, or "
@@ -319,8 +319,8 @@ def _describe_null(unused: list[str], directions, names: tuple[str, ...]) -> str
 
 
 @np.errstate(all="ignore")
-def _describe_runaway(derivation: Derivation, ended: Ended) -> int | None:
-    """The coordinate that runs away, to a pole or to infinity; None where none does."""
+def _describe_runaway(derivation: Derivation, ended: MotionEnd) -> int | None:
+    """Return the index of the coordinate that diverges, to a pole or to infinity; None if none does."""
     if _CODES[ended.code] not in ("dt_min_reached", "nonfinite_state"):
         return None
     try:
@@ -336,8 +336,8 @@ def _describe_runaway(derivation: Derivation, ended: Ended) -> int | None:
     return fastest if scale < part * abs(ended.t_last - ended.t_first) and velocity[fastest] > 0 else None
 
 
-def _escape_place(system: System, derivation: Derivation, params, ended: Ended, place: int) -> str:
-    """The place that a coordinate runs away to: a pole of an operation of the force or of L, or infinity."""
+def _escape_place(system: System, derivation: Derivation, params, ended: MotionEnd, place: int) -> str:
+    """Return a sentence on where a coordinate diverges to: a pole of an operation in the force or L, or infinity."""
     functions, arguments = _short_functions(system, derivation.layout, params, ended)
     pole = next((near for function in functions for near in poles(function, *arguments)), None)
     name, (q, v), (q_first, v_first) = derivation.layout.names[place], halves(ended.y), halves(ended.y_first)
@@ -371,8 +371,8 @@ _EXPLAIN = (
 )  # fmt: skip
 
 
-def _run_check(system: System, derivation: Derivation, params, ended: Ended) -> str:
-    """The first finding of `check` at the end that explains the failure."""
+def _run_check(system: System, derivation: Derivation, params, ended: MotionEnd) -> str:
+    """Return a sentence with the first finding of `check` at the end that explains the failure."""
     jumps = _CODES[ended.code] == "acceleration_discontinuous"
     if jumps and (unheld := _count_unheld(derivation)):
         return (
@@ -389,7 +389,7 @@ def _run_check(system: System, derivation: Derivation, params, ended: Ended) -> 
         return f"\nThere check says: {found[kind].message}{_budget_end(ended)}"
     functions, arguments = _short_functions(system, derivation.layout, params, ended)
     if system.touches:
-        flat = Flat.from_system(system, derivation.layout, params)
+        flat = FlatContacts.from_system(system, derivation.layout, params)
         of_contacts = (lambda q, qdot, t, p: flat.gaps(q, t, p)), flat.one_way, flat.slips
         functions += [f for f in of_contacts if _is_short(f, arguments)]
     pieces = describe_pieces(functions, arguments) if jumps else ""
@@ -397,15 +397,15 @@ def _run_check(system: System, derivation: Derivation, params, ended: Ended) -> 
 
 
 def _count_unheld(derivation: Derivation) -> int:
-    """The borders that the motion may slide along, and machine code does not."""
+    """Return how many borders the motion could slide along without machine code following that."""
     try:
         return 0 if derivation.lowered.borders is None else derivation.lowered.borders.holding.unheld
     except Unlowerable:
         return 0
 
 
-def _budget_end(ended: Ended) -> str:
-    """The time that was reached when the budget of steps was spent."""
+def _budget_end(ended: MotionEnd) -> str:
+    """Return a sentence on the time that was reached when the maximum number of steps was used up."""
     reached, whole = abs(ended.t - ended.t_first), abs(ended.t_last - ended.t_first)
     crossed = _CODES[ended.code] == "acceleration_discontinuous" and ended.steps > MANY_CROSSINGS
     if not (crossed or _CODES[ended.code] == "max_steps_reached") or not reached > 0:
@@ -417,16 +417,18 @@ def _budget_end(ended: Ended) -> str:
     )
 
 
-def _end_acceleration(derivation: Derivation, ended: Ended) -> np.ndarray:
-    """q̈ (n,) at the end."""
+def _end_acceleration(derivation: Derivation, ended: MotionEnd) -> np.ndarray:
+    """Return q̈ (n,) at the end."""
     return ended.sample(derivation, ended.y[None], ended.t).acceleration()[0]
 
 
 # ---- of a trajectory -------------------------------------------------------------------------------------------------
 
 
-def motion_end(trajectory: Trajectory, layout: Layout, member: tuple = (), numbers: np.ndarray | None = None) -> Ended:
-    """The end of a trajectory, or of one member of a batch, and where it began; `numbers` (P,) are its parameters."""
+def motion_end(
+    trajectory: Trajectory, layout: Layout, member: tuple = (), numbers: np.ndarray | None = None
+) -> MotionEnd:
+    """Return the `MotionEnd` of a trajectory, or of one member of a batch; `numbers` (P,) are its parameters."""
 
     def flatten_member(tree, *index):
         leaves = [numbers_at(leaf, (*member, *index)) for leaf in jax.tree.leaves(tree)]
@@ -439,4 +441,4 @@ def motion_end(trajectory: Trajectory, layout: Layout, member: tuple = (), numbe
         numbers = np.array(numbers_of(eqx.filter(trajectory.params, eqx.is_array_like)), layout.dtype)
     y, y_first = flatten_member((end.q, end.qdot)), flatten_member((trajectory.q, trajectory.qdot), 0)
     by_resets = trajectory.transitions is not None
-    return Ended(int(code), float(t), y, float(ts[-1]), float(ts[0]), y_first, int(steps), numbers, by_resets)
+    return MotionEnd(int(code), float(t), y, float(ts[-1]), float(ts[0]), y_first, int(steps), numbers, by_resets)

@@ -1,7 +1,7 @@
-"""`work_precision`: what a digit costs on the user's own scene.
+"""`work_precision`: run time against error, measured on the user's own scene.
 
-A tolerance bounds the error of one step; what one wants to know is the error of the whole motion, and its price. Both
-are measured here: every solver at every tolerance, against one solve that is far tighter than any of them.
+A tolerance bounds the error of one step; a user wants the error of the whole motion, and its cost. Both are measured:
+for every solver at every tolerance, by comparison with one solution that is far more accurate.
 """
 
 import statistics
@@ -87,7 +87,7 @@ _HEADER = ("solver", "rtol", "error", "worst", "time", "per member", "accepted",
 
 
 def _table_cells(row: WorkPrecisionRow) -> tuple[str, ...]:
-    """One row of the table that is printed, in the order of `_HEADER`."""
+    """Return one row of the printed table, in the order of `_HEADER`."""
     return (
         row.solver, f"{row.rtol:.0e}", f"{row.error:.1e}", f"{row.worst_error:.1e}",
         _run_duration(row.seconds), _run_duration(row.seconds_per_trajectory),
@@ -173,7 +173,7 @@ def work_precision(
 
 
 def _reference_path(run: Callable[[float], Trajectory], dtype) -> tuple[np.ndarray, np.ndarray]:
-    """The path to compare with, shape (members, T, n), and for every member how far it can be trusted."""
+    """Return the reference coordinates (members, T, n), and the estimated error of each member's reference."""
     eps = float(jnp.finfo(dtype).eps)
     truth = _coordinate_path(run(_REFERENCE * eps))
     resolution = np.abs(_coordinate_path(run(_CHECK * eps)) - truth).max(axis=(1, 2))
@@ -203,7 +203,7 @@ def _row(name: str, rtol: float, run: Callable[[], Trajectory], truth: np.ndarra
 
 
 def _coordinate_path(trajectory: Trajectory) -> np.ndarray:
-    """All coordinates at all times, shape (members, T, n); NaN throughout for a member that did not reach its end."""
+    """Return all coordinates at all times, (members, T, n); NaN for a member that did not reach its end."""
     return np.where(np.atleast_1d(trajectory.ok)[:, None, None], Members(trajectory).flat(trajectory.q), np.nan)
 
 

@@ -29,6 +29,7 @@ def tip(q, v):
 CART, PUSHED = lagjax.System(cart, forces=push), {"f": 0.0}
 TOP, M = {"a": 0.0, "x": 0.0}, {"M": 2.0}
 PLAIN = lagjax.System(cart, dissipation=lambda q, v: 0.05 * v["a"] ** 2)
+ROD_OF_LENGTH = lagjax.System(lambda q, v: 0.5 * v @ v - G * q[1], constraints=lambda q, params: q @ q - params**2)
 ROD = lagjax.System(lambda q, v: 0.5 * v @ v - G * q[1], constraints=lambda q: q @ q - L**2)
 SKATE = lagjax.System(
     lambda q, v: 0.5 * v @ v, velocity_constraints=lambda q, v: v[0] * jnp.sin(q[2]) - v[1] * jnp.cos(q[2])
@@ -148,8 +149,7 @@ def test_transformations():
     twice = (sample(2.0 + h) - 2 * sample(2.0) + sample(2.0 - h)) / h**2
     np.testing.assert_allclose(jax.jacfwd(jax.jacrev(sample))(2.0), twice, atol=1e-5)
     eigenvalue = jax.jacfwd(lambda r: jnp.trace(jnp.linalg.matrix_power(lagjax.linearize(
-        lagjax.System(lambda q, v: 0.5 * v @ v - G * q[1], constraints=lambda q, params: q @ q - params**2),
-        jnp.stack([0.0, -r]), params=r).reduced().A, 2)))  # fmt: skip
+        ROD_OF_LENGTH, jnp.stack([0.0, -r]), params=r).reduced().A, 2)))  # fmt: skip
     np.testing.assert_allclose(eigenvalue(L), 2 * G / L**2, rtol=1e-10)  # of −2 G/L
     single = lagjax.linearize(CART, {"a": np.float32(0), "x": np.float32(0)}, params=M, inputs=PUSHED, dt=0.05)
     assert single.A.dtype == single.Phi.dtype == np.float32

@@ -1,5 +1,9 @@
 """`Trajectory.animate`: where the points are at every frame, and that the film takes as long as it should."""
 
+import importlib.util
+import shutil
+import sys
+
 import jax
 import jax.numpy as jnp
 import matplotlib
@@ -8,7 +12,7 @@ import pytest
 from scenes import RADIAL_FALL
 
 import lagjax
-from lagjax._show import _animation, course_of
+from lagjax._show import course_of
 
 SPRING = lagjax.System(lambda q, v, params: 0.5 * v["x"] ** 2 - 0.5 * params * q["x"] ** 2)
 SPRING_OF_A_LIST = lagjax.System(lambda q, v, params: 0.5 * v["x"] ** 2 - 0.5 * params["k"][0] * q["x"] ** 2)
@@ -71,7 +75,8 @@ def test_files(run, tmp_path, monkeypatch):
     with image.open(tmp_path / "film.GIF") as gif:
         assert gif.n_frames == 5  # 0.1 s at 100/3 frames a second, and the last
         assert gif.info["duration"] == 30
-    monkeypatch.setattr(_animation, "_find_ffmpeg", lambda: None)
+    monkeypatch.setenv("PATH", "")  # of ffmpeg, and of no other program that a film takes
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     film.save(tmp_path / "film.html")
     text = (tmp_path / "film.html").read_text()
     assert text.startswith("<!doctype html>") and "data:image/png" in text
@@ -83,7 +88,9 @@ def test_files(run, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(_animation._find_ffmpeg() is None, reason="ffmpeg is not there")
+@pytest.mark.skipif(
+    not (shutil.which("ffmpeg") or importlib.util.find_spec("imageio_ffmpeg")), reason="ffmpeg is not there"
+)
 def test_videos_and_space(run, tmp_path):
     film = run.animate(lambda q: jnp.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]) * q["x"], trace=1, speed=30.0)
     film.save(tmp_path / "film.mp4")

@@ -18,8 +18,7 @@ from sweeps import sweep
 import lagjax
 from lagjax import scenes
 from lagjax._engine.diffrax import equations_of
-from lagjax._equations import Derivation, derivation_of
-from lagjax._equations._linear import rank_tolerance
+from lagjax._equations import Derivation, derivation_of, rank_tolerance
 from lagjax._interface import Layout
 
 WAYS = pytest.mark.parametrize(

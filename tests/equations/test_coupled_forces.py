@@ -578,7 +578,7 @@ LIFTED_BLOCK = lagjax.System(lambda q, v: 0.5 * v @ v, forces=lift_and_drag, con
 
 
 def test_a_normal_force_that_is_read_while_its_contact_opens_and_closes():
-    """Lifted by g + (t − 1)(3 − t) it leaves the floor at 1 and falls upon it at 5; impacts bring none."""
+    """LiftedParams by g + (t − 1)(3 − t) it leaves the floor at 1 and falls upon it at 5; impacts bring none."""
     ts = jnp.array([0.0, 0.5, 3.0, 6.0])
 
     def run(c):

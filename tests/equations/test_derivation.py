@@ -35,7 +35,7 @@ SHIFTED = {  # at arguments between 0.1 and 0.9
     "rem": lambda x, y: lax.rem(5 * x, y), "select": lambda x, y: jnp.where((x > y) & (x > 0.3), x * y, y),
 }  # fmt: skip
 EVERY = {
-    name: SHIFTED.get(name) or getattr(lax, row.lax or name)
+    name: SHIFTED.get(name) or getattr(lax, row.lax or name, None) or getattr(jnp, name)
     for name, row in OPERATIONS.items() if name in SHIFTED or not row.is_step
 }  # fmt: skip
 HYPERBOLA = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q: (0.5 * (q[0] * q[1])) ** 2 - 1.0)

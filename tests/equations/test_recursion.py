@@ -7,8 +7,7 @@ import pytest
 
 import lagjax
 from lagjax import scenes
-from lagjax._equations._accelerations import Accelerations
-from lagjax._equations._derivation import columns_of, derivation_of, numbers_of
+from lagjax._equations import Accelerations, columns_of, derivation_of, numbers_of
 from lagjax._interface import Layout
 
 

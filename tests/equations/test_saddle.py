@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from lagjax._equations._saddle import SaddleElimination, elimination_order
+from lagjax._equations import SaddleElimination, elimination_order
 from lagjax._tracing import concatenate, lower_formula, stack
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from lagjax._equations._sparse import Band, Blocks, Diagonal, MatrixFree, Sparse, form_of, refine
+from lagjax._equations import Band, Blocks, Diagonal, MatrixFree, Sparse, form_of, refine
 
 SIZE = 60
 

@@ -7,9 +7,7 @@ import pytest
 from sweeps import sweep
 
 import lagjax
-from lagjax._equations import derivation_of
-from lagjax._equations._patterns import jacobian_pattern
-from lagjax._equations._sparse import Band, Blocks, Diagonal, MatrixFree, Sparse
+from lagjax._equations import Band, Blocks, Diagonal, MatrixFree, Sparse, derivation_of, jacobian_pattern
 from lagjax._interface import Layout
 
 N = 100  # coordinates from which arrays know their patterns

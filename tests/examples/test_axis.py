@@ -58,6 +58,6 @@ def test_an_axis_is_fitted_and_another_record_of_it_followed(tmp_path, capsys):
     for key, value in TRUTH.items():
         assert abs(params[key] - value) < 0.03 * abs(value) + 0.1, (key, params[key])
     at_rest, read_off = errors[files[1]]
-    # Begun 1 mm/s too slowly it ends m/c = 0.5 mm off; so much the velocity off 30 ms may be wrong.
+    # RunResults 1 mm/s too slowly it ends m/c = 0.5 mm off; so much the velocity off 30 ms may be wrong.
     assert read_off < 0.5 < 20 < at_rest, errors
     assert max(errors[files[0]]) < 0.5

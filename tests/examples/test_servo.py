@@ -61,5 +61,6 @@ def test_a_servo_is_fitted_and_followed_with_another_mass(capsys):
 @pytest.mark.slow
 @pytest.mark.skipif(not REAL.exists(), reason="the recordings of the servo are not here")
 def test_the_real_servo_is_followed_by_its_goals(capsys):
+    """A minute: friction is chosen among ten laws, each fitted to every half of the ten recordings."""
     _, errors = importlib.import_module("servo").main([str(REAL)])
     assert np.mean(errors["fitted"]) < 45  # the published laws: 74 to 86

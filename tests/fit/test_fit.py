@@ -369,6 +369,7 @@ def test_intervals_cover_the_truth(kind):
 
 @pytest.mark.slow
 def test_the_real_double_pendulum(capsys):
+    """Twenty seconds: each law of friction is fitted to twenty recordings."""
     file = Path(__file__).parents[3] / "shared" / "data" / "kaheman2022_double_pendulum_identification.npz"
     if not file.exists():
         pytest.skip(f"the recordings are not at {file}")
@@ -408,6 +409,7 @@ def test_a_state_of_first_order_is_the_velocity_of_a_coordinate():
 
 @pytest.mark.slow
 def test_the_real_axis_with_dry_friction(capsys):
+    """Twenty seconds: each law of friction is fitted to the record, and without each half, third and quarter of it."""
     file = Path(__file__).parents[3] / "shared" / "data" / "emps_identification.npz"
     if not file.exists():
         pytest.skip(f"the record is not at {file}")

@@ -170,7 +170,22 @@ def test_timings_of_transitions_and_functions_do_not_mix():
 def test_bounces_that_a_motion_does_not_have_are_counted():
     late = lagjax.Timings(BOUNCE, np.array([0.6, 1.2]), 0.0, (0.5, 0.0), numbers=np.array([0, 9]))
     with pytest.raises(ValueError, match=r"There are \d transitions from 'flight' to 'flight' up to .* but number 9"):
-        lagjax.fit(BALL, late, {"e": 0.95})
+        lagjax.fit(BALL, late, {"e": 0.95}, starts=1)
+    found = lagjax.fit(BALL, late, {"e": 0.95})  # of the closest that any ball can do
+    assert "The motion with params0 could not be followed" in found.message and found.rms["times"] > 0.1
+
+
+@pytest.mark.slow
+def test_where_the_first_guess_cannot_be_followed_other_starts_are_tried_and_said(stuck, capfd):
+    begin = {"k": 4.6, "kinetic": 0.71, "static": 0.61}  # it cannot stick where it slips: static below kinetic
+    with pytest.raises(ValueError, match="Begin nearer"):
+        lagjax.fit(BLOCK, stuck, begin, transforms=lagjax.positive, starts=1)
+    fit = lagjax.fit(BLOCK, stuck, begin, transforms=lagjax.positive, progress=True)
+    low, high = fit.intervals(0.9999)
+    assert fit.ok and all(low[name] < FRICTION[name] < high[name] for name in FRICTION)
+    assert "The motion with params0 could not be followed" in fit.message and len(fit.waterfall.misfits) % 16 == 0
+    said = capfd.readouterr().err
+    assert "One start is not enough, others are tried: The motion of records[0]" in said and "start 16 of 16:" in said
 
 
 def test_a_trial_plays_its_motion_once(monkeypatch):
@@ -226,13 +241,25 @@ def test_a_puck_between_walls_is_found_from_far_or_said_not_to_be():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mu", [0.05, 0.3])
-def test_an_oblique_impact_that_slides_is_found_from_where_it_sticks(mu):
+@pytest.mark.parametrize("mu, starts", [(0.05, 1), (0.1, 1), (0.3, None)])
+def test_an_oblique_impact_that_slides_is_found_from_where_it_sticks(mu, starts):
     ts, start = np.linspace(0.0, 2.0, 101), (jnp.array([0.0, 1.0]), jnp.array([0.2772, -1.0]))
     exact = np.asarray(lagjax.simulate(CUSHION, *start, ts, {"mu": 0.15, "e": 0.8}).q)  # from 0.154 on it sticks
     record = lagjax.Record(ts, exact + 0.002 * np.random.default_rng(0).normal(size=exact.shape), start=start)
-    found = lagjax.fit(CUSHION, record, {"mu": mu, "e": 0.7}, transforms=lagjax.positive)
+    found = lagjax.fit(CUSHION, record, {"mu": mu, "e": 0.7}, transforms=lagjax.positive, starts=starts)
     assert found.ok and found.params["mu"] == pytest.approx(0.15, abs=0.003)
+    assert (found.waterfall is None) == (starts == 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mu", [0.1, 0.3])
+def test_an_oblique_impact_that_sticks_does_not_tell_its_friction(mu):
+    ts, start = np.linspace(0.0, 2.0, 101), (jnp.array([0.0, 1.0]), jnp.array([0.2772, -1.0]))
+    exact = np.asarray(lagjax.simulate(CUSHION, *start, ts, {"mu": 0.3, "e": 0.8}).q)
+    record = lagjax.Record(ts, exact + 0.002 * np.random.default_rng(0).normal(size=exact.shape), start=start)
+    found = lagjax.fit(CUSHION, record, {"mu": mu, "e": 0.7}, transforms=lagjax.positive, starts=1)
+    assert not found.ok and "params['mu']" in found.unseen[0] and found.params["e"] == pytest.approx(0.8, abs=0.003)
+    assert found.waterfall is None
 
 
 # ---- sampled inputs --------------------------------------------------------------------------------------------------
@@ -242,7 +269,7 @@ def fall(q, qdot):
     return 0.5 * qdot**2 - 9.81 * q
 
 
-def push_by_inputs(damped):
+def add_input_forces(damped):
     return lambda q, qdot, params, inputs: params["gain"] * inputs - damped * params["c"] * qdot
 
 
@@ -285,7 +312,7 @@ def test_motion_that_jumps_is_driven_by_samples(build, begin, change, ts, truth,
         for k, start in enumerate(((begin, 0.0), lagjax.Guess(0.95 * begin, 0.1)))
     ]
     free = dict.fromkeys({"c": 0.0} | params0, True) | {"c": "c" in truth}
-    fit = lagjax.fit(build(push_by_inputs), rows, {"c": 0.0} | params0, free=free)
+    fit = lagjax.fit(build(add_input_forces), rows, {"c": 0.0} | params0, free=free)
     low, high = fit.intervals(0.999)
     assert fit.ok and all(low[key] < value < high[key] for key, value in truth.items())
     assert fit.starts[1][0] == pytest.approx(begin, abs=2e-3)

@@ -21,7 +21,7 @@ def driven(q, qdot, params, inputs):
     return params["gain"] * inputs["u"] - params["c"] * qdot
 
 
-SCENE = lagjax.System(spring, forces=driven)
+SCENE, UNDRIVEN = lagjax.System(spring, forces=driven), lagjax.System(spring)
 
 
 def inputs_of(ts, seed=0):
@@ -181,14 +181,14 @@ def test_sensors_with_a_delay_may_see_time_and_inputs():
 
 def test_what_is_wrong_with_delays_is_a_sentence():
     u = inputs_of(TS)
-    scene, record = lagjax.System(SCENE.lagrangian.code.function), lagjax.Record(TS[:10], u[:10], start=(0.0, 0.0))
+    record = lagjax.Record(TS[:10], u[:10], start=(0.0, 0.0))
     first = {"k": 1.0, "tau": 0.05}
     with pytest.raises(ValueError, match=r"Record 0 is 0\.18 long, shorter than the longest delay"):
-        lagjax.fit(scene, record, first, observe=lagjax.Delayed(lambda params: params["tau"], 0.2))
+        lagjax.fit(UNDRIVEN, record, first, observe=lagjax.Delayed(lambda params: params["tau"], 0.2))
     with pytest.raises(ValueError, match=r"A delay is 0.05, but must lie between 0 and the longest one, 0.04"):
-        lagjax.fit(scene, record, first, observe=lagjax.Delayed(lambda params: params["tau"], 0.04), method="whole")
+        lagjax.fit(UNDRIVEN, record, first, observe=lagjax.Delayed(lambda params: params["tau"], 0.04), method="whole")
     with pytest.raises(ValueError, match="delay must return one number, or a prefix"):
-        lagjax.fit(scene, record, first, observe=lagjax.Delayed(lambda params: {"x": 0.0}, 0.04))
+        lagjax.fit(UNDRIVEN, record, first, observe=lagjax.Delayed(lambda params: {"x": 0.0}, 0.04))
     with pytest.raises(ValueError, match="longest must be a positive number"):
         lagjax.Delayed(lambda params: 0.0, 0.0)
 
@@ -303,7 +303,7 @@ def test_what_is_wrong_with_inputs_is_a_sentence():
     with pytest.raises(ValueError, match=r"forces asks for `inputs`, which records.0. has none of"):
         lagjax.fit(SCENE, bare, TRUTH)
     with pytest.raises(ValueError, match=r"observe asks for `inputs`, which records.0. has none of"):
-        lagjax.fit(lagjax.System(SCENE.lagrangian.code.function), bare, TRUTH, observe=lambda q, qdot, inputs: q)
+        lagjax.fit(UNDRIVEN, bare, TRUTH, observe=lambda q, qdot, inputs: q)
     with pytest.raises(ValueError, match=r"records\[1\] has different inputs from records\[0\]"):
         lagjax.fit(SCENE, [record, bare], TRUTH)
     with pytest.raises(ValueError, match="hold must be one of 'zero', 'linear', 'cubic', 'band'; got 'spline'"):

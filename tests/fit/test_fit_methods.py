@@ -8,11 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 import lagjax
-from lagjax._fit import Parameters
-from lagjax._fit.model import _transforms
-from lagjax._fit.model._transforms import Unbounded
+from lagjax._fit import Parameters, Unbounded
 
 TS = np.linspace(0.0, 4.0, 101)
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -170,7 +169,7 @@ def test_a_leaf_that_starts_outside_of_its_set_is_refused(start, transform, mess
 
 
 def test_the_sum_of_a_simplex_is_that_of_its_start():
-    own = _transforms.simplex.specialize(np.array([1.0, 2.0, 4.0]), (3,))
+    own = lagjax.simplex.specialize(np.array([1.0, 2.0, 4.0]), (3,))
     assert np.sum(own.value(np.array([0.3, -2.0]))) == pytest.approx(7.0)
 
 
@@ -352,6 +351,49 @@ def test_accelerations_of_local_cubics_begin_where_parameters_are_far_off(factor
     one = lagjax.Record(ts, q + 0.02 * np.random.default_rng(0).normal(size=q.shape))
     fit = lagjax.fit(SPRING, one, {"k": 4.0 * factor, "c": 0.3 * factor}, transforms=lagjax.positive)
     assert fit.ok and fit.params["k"] == pytest.approx(4.0, rel=0.01) and fit.params["c"] == pytest.approx(0.3, rel=0.1)
+
+
+OSCILLATOR = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2)
+PENDULUM = lagjax.System(lambda q, v, params: 0.5 * v**2 + params["k"] * jnp.cos(q))
+
+
+def test_first_samples_find_a_frequency_where_starts_are_known():
+    # Over seven periods the sum of squares has many minima; the sine of an angle is no position to read a start off.
+    ts = np.linspace(0.0, 20.0, 401)
+    motion = lagjax.simulate(PENDULUM, 1.0, 0.0, ts, {"k": 5.0})
+    values = {"sine": np.sin(np.asarray(motion.q)) + 1e-3 * np.random.default_rng(0).normal(size=ts.size)}
+    record = lagjax.Record(ts, values, start=(1.0, 0.0))
+    settings = {"observe": lambda q, v: {"sine": jnp.sin(q)}, "transforms": lagjax.positive}
+    assert not lagjax.fit(PENDULUM, record, {"k": 2.0}, method="whole", **settings).ok
+    found = lagjax.fit(PENDULUM, record, {"k": 2.0}, **settings)
+    assert found.ok and found.params["k"] == pytest.approx(5.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("fitted", [False, True])
+def test_hundreds_of_records_have_the_least_squares_of_scipy(fitted):
+    rng, ts = np.random.default_rng(0), 0.2 * np.arange(5)
+    starts = rng.normal(size=(400, 2))
+
+    def motions(k, starts):
+        w, (q, v) = np.sqrt(k), starts.T[..., None]
+        return q * np.cos(w * ts) + v / w * np.sin(w * ts)
+
+    shown = motions(2.0, starts) + 1e-2 * rng.normal(size=(400, 5))
+    begin = lagjax.Guess if fitted else lambda *pair: pair
+    records = [lagjax.Record(ts, {"x": x}, start=begin(*y)) for x, y in zip(shown, starts, strict=True)]
+    found = lagjax.fit(OSCILLATOR, records, {"k": 1.0}, observe=lambda q, v: {"x": q})
+
+    def residuals(x):
+        if not fitted:
+            return np.ravel(motions(x[0], starts) - shown)
+        w = np.sqrt(x[0])  # the starts enter linearly, and alike for all records
+        shape = np.stack([np.cos(w * ts), np.sin(w * ts) / w], axis=1)
+        return np.ravel(shown @ (shape @ np.linalg.pinv(shape)) - shown)
+
+    best = least_squares(residuals, [1.0], xtol=1e-12, ftol=1e-12)
+    error = 1e-2 / np.linalg.norm(best.jac)
+    assert found.ok and found.params["k"] == pytest.approx(best.x[0], abs=0.05 * error)
+    assert np.sqrt(found.covariance.matrix[0, 0]) == pytest.approx(error, rel=0.2)
 
 
 @pytest.mark.slow

@@ -124,6 +124,22 @@ def test_the_step_is_the_solution_of_the_whole_problem():
     assert (np.abs(_descent.eliminate(triangles, states, scale, damping, pull, unknowns, limits).u) <= 1e-3).all()
 
 
+@pytest.mark.parametrize("own", [0, 2])
+def test_sums_over_records_are_those_of_whole_rows(own):
+    rng, records, shared = np.random.default_rng(0), 6, 3
+    owners = np.array([0, 0, 1, 2, 2, 2])
+    count = own * 3 + shared
+    places = [[*(own * owner + np.arange(own)), *range(own * 3, count)] for owner in owners]
+    unknowns = Unknowns(np.array(places), owners, own, count)
+    local = rng.normal(size=(records, 4, own + shared))
+    whole = np.zeros((records, 4, count))
+    for row, columns in enumerate(places):
+        whole[row][:, columns] = local[row]
+    np.testing.assert_array_equal(unknowns.spread(local), whole)
+    flat = whole.reshape(-1, count)
+    np.testing.assert_allclose(unknowns.add(local.swapaxes(1, 2) @ local), flat.T @ flat, atol=1e-14)
+
+
 def test_records_of_the_fit_and_others_are_predicted(offsets):
     own = offsets.predict(RECORDS[3])
     np.testing.assert_allclose(own.residuals, offsets.residuals[3], atol=1e-4)

@@ -688,7 +688,7 @@ def test_a_member_alone_is_bit_for_bit_the_member_of_a_batch(make):
     for one, all_ in zip(alone[:6], together[:6], strict=True):
         np.testing.assert_array_equal(one[0], all_[1])
     assert kernel.select_width(1).width == 1 and kernel.select_width(2) is kernel
-    order, cotangents = _kernel.order_for(1e-9), (np.ones_like(together.path), np.ones_like(together.y_end))
+    order, cotangents = _kernel.choose_order(1e-9), (np.ones_like(together.path), np.ones_like(together.y_end))
     back = [
         kernel.select_width(len(run.steps)).vjp(
             ts, numbers, _native.Steps(run.table, run.steps.cumsum() - run.steps, run.steps, order),

@@ -41,7 +41,7 @@ def run_and_back(kernel, ts, y0, params):
     counts = np.where(run.complete, run.steps, 0)
     first = np.cumsum(counts) - counts
     cotangents = np.random.default_rng(0).normal(size=run.path.shape), np.ones_like(y0)
-    record = _native.Steps(run.table, first, counts, _native.order_for(RTOL))
+    record = _native.Steps(run.table, first, counts, _native.choose_order(RTOL))
     return run, kernel.vjp(ts[None], params, record, *cotangents)
 
 

@@ -112,6 +112,47 @@ def test_tangents_across_a_motion_that_is_simpler_than_they_are():
 PENDULUM = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
 
 
+def swing_with_narrow_friction(q, v, params):
+    return -0.1 * v - params["c"] * params["law"](v / params["width"])
+
+
+NARROW = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2, forces=swing_with_narrow_friction)
+
+
+@pytest.mark.parametrize("law", [jnp.tanh, jax.nn.sigmoid])
+@pytest.mark.parametrize("width", [1e-3, 1e-9])
+def test_tangents_by_the_weight_of_a_narrow_function_that_is_zero(law, width):
+    """A motion knows nothing of a term of weight zero: its steps are as long as they may be, and its tangents turn
+    within them. For friction that is sgn(v), or half of that and a half, the tangent has a closed form."""
+    ts = np.linspace(0.0, 10.0, 101)
+
+    def end(c):
+        return lagjax.simulate(NARROW, 1.0, 0.0, ts, {"c": c, "width": width, "law": law}).q[-1]
+
+    w, decay = np.sqrt(1 - 0.05**2), 0.05
+    s = np.concatenate([[0.0], np.arange(1, 4) * np.pi / w, [10.0]])  # where v changes its sign, which begins as -1
+
+    def response(t):
+        """The integral from 0 to t of exp(−a t) sin(w t) / w."""
+        return (1 - np.exp(-decay * t) * (np.cos(w * t) + decay / w * np.sin(w * t))) / (w**2 + decay**2)
+
+    signs = [-1.0, 1.0, -1.0, 1.0]
+    exact = -sum(sign * (response(10 - a) - response(10 - b)) for sign, a, b in zip(signs, s[:-1], s[1:], strict=True))
+    if law is jax.nn.sigmoid:
+        exact = 0.5 * exact - 0.5 * response(10.0)
+    for derive in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derive(end)(0.0), exact, rtol=1e-7 if width < 1e-6 else 1e-3)
+
+
+def test_tangents_are_none_where_a_step_passes_a_jump_unseen():
+    params = {"width": 1e-6, "law": jnp.atan}
+
+    def end(c):
+        return lagjax.simulate(NARROW, 1.0, 0.0, np.linspace(0.0, 10.0, 101), params | {"c": c}).q[-1]
+
+    assert np.isnan(jax.jacfwd(end)(0.0)) and np.isnan(jax.jacrev(end)(0.0))
+
+
 def test_steps_that_suit_no_tangent_give_none(monkeypatch):
     monkeypatch.setattr(_derivatives, "TRIES", 0)
     slope = jax.jacfwd(lambda q: lagjax.simulate(PENDULUM, q, 0.0, jnp.array([0.0, 10.0]), throw=False).q[-1])(0.0)

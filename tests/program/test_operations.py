@@ -11,11 +11,9 @@ from jax import lax
 from scipy import special
 
 from lagjax import _native
-from lagjax._equations._blame import borders
-from lagjax._program import OPERATIONS, Unlowerable
-from lagjax._program._operations import Operation
-from lagjax._tracing import lower
-from lagjax._tracing._emit import WRITTEN
+from lagjax._equations import borders
+from lagjax._program import OPERATIONS, Operation, Unlowerable
+from lagjax._tracing import WRITTEN, lower
 
 
 @pytest.fixture(autouse=True)

@@ -10,7 +10,7 @@ import pytest
 from scenes import BALL, HILL, VALLEY
 
 import lagjax
-from lagjax._engine._stop_reason import End, what_stopped
+from lagjax._engine import End, find_stop_flags
 
 TS = np.linspace(0.0, 2.0, 5)
 BUDGET = {"max_steps": 2000}
@@ -225,7 +225,7 @@ def test_what_stopped(name):
 
     at = End(one, np.array([[0.0, 1.0]] * 2), 0 * one, 2 * one, count, count)
     shrank = np.array([True, False])
-    not_finite, jumped = what_stopped(acceleration, at, shrank, ~shrank)
+    not_finite, jumped = find_stop_flags(acceleration, at, shrank, ~shrank)
     assert not_finite.tolist() == [ends, False], "a spent budget does not ask what lies ahead"
     near = not (name == "a step of time")  # beyond the smallest steps
     assert jumped.tolist() == [jumps and near, jumps]

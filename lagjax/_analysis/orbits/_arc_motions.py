@@ -1,9 +1,9 @@
-"""`Arcs`: motions of many starts over times of their own, with their derivatives, on rows of NumPy.
+"""`Arcs`: integrates many motions over different times, with their derivatives, in NumPy arrays of R rows.
 
-What shooting asks of machine code: rows of starts (R, 2n), each with a first and a last time, give the last states
-(R, 2n) and how these depend on the starts (R, 2n, 2n) and on directions of the parameters (R, 2n, F). Machine code
-follows all directions over the steps of the motion, without a program of XLA, so that another number of rows compiles
-nothing, and no kernel of LAPACK runs inside of one.
+Shooting needs: from starts (R, 2n), each with a first and a last time, the last states (R, 2n), and their derivatives
+by the starts (R, 2n, 2n) and along directions of the parameters (R, 2n, F). Machine code integrates all directions over
+the steps of the motion, without a program of XLA, so that another number of rows compiles nothing, and no kernel of
+LAPACK runs inside of one.
 """
 
 import copy
@@ -20,25 +20,17 @@ from lagjax._analysis.orbits._jumping_motions import JumpingMotions
 from lagjax._engine import Problem
 from lagjax._engine.taylor import MachineCode, Motions, flow_of, jvp, tolerances_of
 from lagjax._equations import Sample, Scales, has_constraints
-from lagjax._interface import (
-    SUCCESSFUL,
-    Layout,
-    as_arrays,
-    halves,
-    require_concrete,
-    require_finite,
-    require_number,
-)
+from lagjax._interface import SUCCESSFUL, Layout, as_arrays, halves, require_concrete, require_finite, require_number
 from lagjax._primitives import sentence
 from lagjax._run.hybrid import Scene, first_law, jumps, laws, require_scene
 from lagjax._scene import drop_contacts, require_system
 
 
 class Arc(NamedTuple):
-    """R arcs: `end` (R, 2n), its `rate` (R, 2n), `by_start` (R, 2n, 2n), `by_params` (R, 2n, F), and how each ended.
+    """R arcs: `end` (R, 2n), its time derivative `rate`, `by_start` (R, 2n, 2n), `by_params` (R, 2n, F), and results.
 
-    `steps` (R,) counts what was taken; `result` (R,) and `t_end` (R,) are those of a `Solution`. Rows that failed are
-    NaN. `returns` (R,) tells whether it ended in the mode in which it began.
+    `steps` (R,) counts steps; `result` (R,) and `t_end` (R,) are those of a `Solution`. Rows that failed are NaN.
+    `returns` (R,): True if the arc ended in the mode in which it began.
     """
 
     end: np.ndarray
@@ -57,8 +49,10 @@ class Arc(NamedTuple):
 
 
 class Units(NamedTuple):
-    """The sizes of states, `state` (R, 2n), and of times, `time` (R,), which make q and q̇ comparable: that of
-    coordinate i is l/√Mᵢᵢ, `length` (R,) being l, and that of its velocity as much in a unit of time."""
+    """Units of states (R, 2n) and of times (R,), which make q and q̇ comparable.
+
+    The unit of qᵢ is l/√Mᵢᵢ, l being `length` (R,), that of q̇ᵢ this per unit of time.
+    """
 
     state: np.ndarray
     time: np.ndarray
@@ -68,7 +62,7 @@ class Units(NamedTuple):
         return Units(*(np.repeat(x, count, axis=0) for x in self))
 
     def growth(self, growth: np.ndarray) -> np.ndarray:
-        """Derivatives of states by states, (R, …, 2n, 2n), in these units."""
+        """Convert derivatives of states by states, (R, …, 2n, 2n), to these units."""
         state = self.state.reshape(len(self.state), *[1] * (growth.ndim - 3), -1)
         return growth * state[..., None, :] / state[..., :, None]
 
@@ -78,7 +72,7 @@ def _positive_or_one(x: np.ndarray) -> np.ndarray:
 
 
 class Arcs:
-    """The follower of motions of one scene with one set of parameters, `numbers` (P,)."""
+    """Integrates motions of one scene with one set of parameters, `numbers` (P,)."""
 
     def __init__(self, problem: Problem, numbers: np.ndarray, jumping: JumpingMotions | None = None):
         self.problem, self.numbers, self.jumping = problem, numbers, jumping
@@ -92,7 +86,7 @@ class Arcs:
     def from_system(
         cls, scene: Scene, layout: Layout, params: PyTree, rtol: float, what: str, may_jump: bool = False
     ) -> "Arcs":
-        """The arcs of a scene, for `what` a sentence names; with contacts or modes only where it `may_jump`."""
+        """Return the arcs of a scene; `what` is for messages; contacts and modes are refused unless `may_jump`."""
         scene = require_scene(scene) if may_jump else require_system(scene)
         jumping = JumpingMotions(scene, layout, params, rtol) if jumps(scene) else None
         require_untraced((laws(scene), params), "A parameter")
@@ -119,14 +113,16 @@ class Arcs:
         return other
 
     def ends(self, times: np.ndarray, y0: np.ndarray):
-        """The motions alone: their `Solution`, or `JumpRun`, `times` (R, T) or (1, T) and `y0` (R, 2n)."""
+        """Integrate without derivatives, `times` (R, T) or (1, T) and `y0` (R, 2n): a `Solution` or `JumpRun`."""
         if self.jumping is not None:
             return self.jumping.run(times, y0)
         return self.flow.run(times, y0, self.numbers[None], self.tolerances)
 
     def equal_shares(self, span: np.ndarray, y0: np.ndarray, count: int) -> np.ndarray:
-        """Parts (R, count + 1), from 0 to 1, of spans of time (R,) in which motions take about equally many steps; each
-        begins at the calmest moment near there, where states are small and change slowly."""
+        """Divide spans (R,) into `count` parts with about equally many steps each: fractions (R, count + 1).
+
+        A part begins where the state is small and changes slowly, if there is such a time nearby.
+        """
         shares = np.tile(np.arange(count + 1) / count, (len(y0), 1))
         times = np.stack([np.zeros_like(span), span], axis=1)
         room = min(_BUDGET * len(y0), _MOST_WRITTEN // (y0.shape[1] + 4))
@@ -140,7 +136,7 @@ class Arcs:
         return shares
 
     def follow(self, times: np.ndarray, y0: np.ndarray, directions: np.ndarray | None = None, modes=None) -> Arc:
-        """The arcs between `times` (R, 2) from `y0` (R, 2n), in `modes` (R,), by the parameters along `directions`."""
+        """Integrate from `y0` (R, 2n), in `modes` (R,), over `times` (R, 2), with derivatives: an `Arc`."""
         rows, states = y0.shape
         if self.jumping is not None:
             run = self.jumping.run(times, y0, modes, varies=True)
@@ -163,8 +159,10 @@ class Arcs:
         return Arc(end, self.rate(times[:, 1], end), by_start, by_params, run.result, run.t_end, run.accepted)
 
     def units(self, y0: np.ndarray, time: np.ndarray | None = None) -> "Units":
-        """The units of states (R, 2n), from the largest coordinate and velocity in the metric of M; `time` (R,) is read
-        off the rates by default."""
+        """Return the units of states (R, 2n), from the largest coordinate and velocity in the metric of M.
+
+        `time` (R,) is the unit of time; by default it is the ratio of states to their rates.
+        """
         n = self.size
         mass = np.abs(self.sample(0.0, y0).quantities("mass_matrix")["mass_matrix"][:, np.arange(n), np.arange(n)])
         root = _positive_or_one(np.sqrt(np.where(mass > 0, mass, mass.max(axis=1, initial=0.0)[:, None])))
@@ -188,27 +186,29 @@ class Arcs:
         return self.sample(0.0, np.concatenate([q, qdot], axis=1)).quantities(name)[name]
 
     def sample(self, t, y: np.ndarray) -> Sample:
-        """The scene at states (R, 2n) and times () or (R,)."""
+        """Return a `Sample` of the scene at states (R, 2n) and times () or (R,)."""
         return Sample.from_states(self.derivation, y, np.broadcast_to(np.asarray(t, float), (len(y),)), self.numbers)
 
     def rate(self, t, y: np.ndarray) -> np.ndarray:
-        """ẏ = (q̇, q̈), (R, 2n), at states (R, 2n) and times () or (R,)."""
+        """Return ẏ = (q̇, q̈), (R, 2n), at states (R, 2n) and times () or (R,)."""
         values = self.flow.general_program.evaluate_many([*y.T, t, *self.numbers])
         return np.concatenate([y[:, self.size :], values[: self.size].T], axis=1)
 
     def energy(self, t, y: np.ndarray) -> np.ndarray:
-        """h = p·q̇ − L (R,)."""
+        """Return h = p·q̇ − L, (R,)."""
         of = self.sample(t, y).quantities("lagrangian", "momentum")
         return np.sum(of["momentum"] * halves(y)[1], axis=1) - of["lagrangian"].reshape(len(y))
 
     def energy_slope(self, t, y: np.ndarray) -> np.ndarray:
-        """∂h/∂y (R, 2n)."""
+        """Return ∂h/∂y, (R, 2n)."""
         of = self.sample(t, y).quantities("energy_by_q", "mass_matrix")
         return np.concatenate([of["energy_by_q"], np.einsum("rij,rj->ri", of["mass_matrix"], halves(y)[1])], axis=1)
 
     def canonical(self, t, y: np.ndarray, units: Units) -> np.ndarray:
-        """∂(q, p)/∂(q, q̇) (R, 2n, 2n), q and q̇ in units (R, 2n), and p in those that l² and the time belong to. The
-        product of the units of qᵢ and pᵢ is then the same for all i, so that the symplectic form is the usual one."""
+        """Return ∂(q, p)/∂(q, q̇), (R, 2n, 2n), with q and q̇ in `units`, in which the symplectic form is standard.
+
+        The unit of pᵢ is such that its product with that of qᵢ is the same for all i.
+        """
         n, sample = self.size, self.sample(t, y)
         chart = np.zeros((len(y), 2 * n, 2 * n))
         chart[:, :n, :n], chart[:, n:, :n] = np.eye(n), sample.momenta_by_q(tuple(range(n)))
@@ -233,8 +233,10 @@ _MOST_WRITTEN = 2**26  # numbers of steps of all motions whose shares are sought
 
 
 def starts(q0: PyTree, qdot0: PyTree, time, name: str) -> tuple[np.ndarray, Layout, np.ndarray]:
-    """The times, () or (N,), the layout of one state, and all states (1 or N, 2n); `time`, called `name`, is a number
-    or one per member. Raises `TypeError` or `ValueError` where that is not so, or a number is not finite, or traced."""
+    """Check starts and `time`, called `name`, one for all or one per member: times () or (N,), layout, states (N, 2n).
+
+    Raises `TypeError` or `ValueError` if they do not fit together, are traced, or not finite.
+    """
     require_untraced((q0, qdot0, time), "The start")
     if isinstance(time, dict | eqx.Module):
         require_number(time, name)

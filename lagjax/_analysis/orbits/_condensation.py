@@ -2,10 +2,10 @@
 
     A_k x_k + B_k x_(k+1) + C_k z = 0,  k = 0 … K−1
 
-Two neighbours share an unknown; a QR decomposition of its columns splits them into what determines it and one equation
-without it. K a power of two, log₂ K rounds leave A x_0 + B x_K + C z = 0. No product of many arcs is formed, whose
-rounding would drown what does not grow, and orthogonal steps leave sizes as they are, so that singular values of A + B
-can be judged. Of the alternatives, a singular value decomposition of the whole chain takes K² times as long.
+Two neighbours share an unknown; a QR decomposition of its columns gives one equation that determines it and one without
+it. K a power of two, log₂ K rounds leave A x_0 + B x_K + C z = 0. No product of many arcs is formed, in whose rounding
+the directions that do not grow would be lost, and orthogonal steps preserve norms, so that singular values of A + B are
+meaningful. A singular value decomposition of the whole chain would take K² times as long.
 
 Source: Wright, *Stable parallel algorithms for two-point boundary value problems*, SIAM J. Sci. Stat. Comput. 13 (1992)
 742.
@@ -25,7 +25,7 @@ class Round(NamedTuple):
 
 
 class Condensed(NamedTuple):
-    """A (B, s, s), B (B, s, s) and C (B, s, c) of the ends, and the rounds that led there."""
+    """The equation A x_0 + B x_K + C z = 0 of the ends, (B, s, s), (B, s, s), (B, s, c), and the elimination rounds."""
 
     first: np.ndarray
     last: np.ndarray
@@ -33,7 +33,7 @@ class Condensed(NamedTuple):
     rounds: tuple[Round, ...]
 
     def inner(self, x: np.ndarray, end: np.ndarray, z: np.ndarray) -> np.ndarray:
-        """All unknowns (B, K, s, m) from those at the ends, x_0 and x_K (B, s, m), and z (B, c, m)."""
+        """Return all unknowns (B, K, s, m) from those at the ends, x_0 and x_K (B, s, m), and z (B, c, m)."""
         known = np.stack([x, end], axis=1)
         for of in reversed(self.rounds):
             left, right = known[:, :-1], known[:, 1:]
@@ -45,7 +45,7 @@ class Condensed(NamedTuple):
 
 
 def condense(growth: np.ndarray, more: np.ndarray) -> Condensed:
-    """A chain with A_k = `growth` (B, K, s, s), B_k = −1 and C_k = `more` (B, K, s, c), K a power of two."""
+    """Condense a chain with A_k = `growth` (B, K, s, s), B_k = −1, C_k = `more` (B, K, s, c), K a power of two."""
     s, left, right, rounds = growth.shape[2], growth, np.broadcast_to(-np.eye(growth.shape[2]), growth.shape), []
     while left.shape[1] > 1:
         q, r = np.linalg.qr(np.concatenate([right[:, ::2], left[:, 1::2]], axis=2), mode="complete")

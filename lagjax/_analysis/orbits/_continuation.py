@@ -1,16 +1,16 @@
-"""The continuation of a family of periodic orbits: what is free along it, its tangent, steps of which none is a jump.
+"""Continuation of a family of periodic orbits: its unknowns, its tangent, and steps with a check against jumps.
 
     predict   along the null vector of the closing equations that is no symmetry
     correct   by Newton's method within the plane across it, at the same length of arc
 
 The rank of the closing equations is decided at closed orbits, where degenerate directions are so to rounding, and is
-that of the trials between them. Decided anew at every trial it would have to leave out all that the trial's defect
-may hide, which of an orbit with a multiplier of a thousand is everything but that one direction. Nor are these
-corrections damped, as those of `_shooting` are: how they contract is what judges a step.
+kept for the trials between them. Decided anew at every trial it would have to leave out all that the trial's defect may
+hide, which of an orbit with a multiplier of a thousand is everything but that one direction. Nor are these corrections
+damped, as those of `_shooting` are: how they contract is what judges a step.
 
-A step stands if Newton's method contracts, if its first correction is short beside the step, and if the chord lies
-midway between tangents that turned little. An orbit of another family that happens to be near fails one of these, or
-is as near as the family bends; how close each is to its bound says how long the next step may be.
+A step is accepted if Newton's method contracts, if its first correction is short beside the step, and if the chord lies
+midway between tangents that turned little. An orbit of another family that happens to be near fails one of these, or is
+as near as the family bends; the ratios to these bounds determine the next step.
 
 Source: Allgower & Georg, *Numerical Continuation Methods* (1990), §6.1 (steps by contraction, distance and angle), §8
 (branch points).
@@ -43,8 +43,11 @@ _LONGEST_GROWTH = 1e3
 
 
 class FamilyPoint(NamedTuple):
-    """An orbit of a family: its chain (of one member), the numbers of the scene, and the closing equations there.
-    `matrix` (2n, 2n + F) are those of the first state and of what else is free, `right` (2n,) their right-hand side."""
+    """An orbit of a family: its chain (of one member), the numbers of the scene, and the closing equations.
+
+    `matrix` (2n, 2n + F) is their Jacobian by the first state and the other unknowns, `right` (2n,) their right-hand
+    side.
+    """
 
     chain: Chain
     numbers: np.ndarray
@@ -57,13 +60,15 @@ class FamilyPoint(NamedTuple):
         return FamilyUnknowns(self.chain.y, self.chain.period, self.numbers)
 
     def closed(self, share: float) -> bool:
-        """True if all arcs could be followed and close to this share of the size of the state."""
+        """True if all arcs were integrated and close to this fraction of the size of the state."""
         return bool(self.chain.ok[0] and self.chain.closure()[0] <= share * self.chain.size()[0])
 
 
 class FamilyTangent(NamedTuple):
-    """The direction in which a family continues: the unit `vector` (2n + F,), the rank of the closing equations at a
-    closed orbit, and its symmetries (2n + F, k), an orthonormal basis."""
+    """The direction of a family: a unit `vector` (2n + F,), the rank of the closing equations, and its symmetries.
+
+    The symmetries (2n + F, k) are an orthonormal basis.
+    """
 
     vector: np.ndarray
     rank: int
@@ -79,9 +84,11 @@ class FamilyUnknowns(NamedTuple):
 
 
 class Follower:
-    """The unknowns along a family: the first state, the period unless it stays, a parameter if it has a place; in units
-    of the first orbit, (1, 2n) and (1,), and of the parameter's first value. `until` is the value where the family
-    ends."""
+    """Evaluates orbits of a family by its unknowns: first state, the period if free, a parameter if it has a `place`.
+
+    They are in units of the first orbit, (1, 2n) and (1,), and of the parameter's first value. The family ends at
+    `until`.
+    """
 
     def __init__(self, arcs: Arcs, place: int | None, y0: np.ndarray, period: np.ndarray, until: float | None = None):
         self.arcs, self.place, self.until = arcs, place, until
@@ -94,7 +101,7 @@ class Follower:
         return Closing.plain(self.arcs.with_numbers(numbers))
 
     def point(self, y, period, parts, numbers) -> FamilyPoint:
-        """The chain through these states, (1, K, 2n), and its equations."""
+        """Return the chain through these states, (1, K, 2n), and its closing equations."""
         closing = self.closing(numbers)
         chain = _shooting.follow(closing, y, period, parts, self.units)
         columns = [chain.rate[..., None] * np.diff(chain.parts)[..., None, None]] if self.period_is_free else []
@@ -108,7 +115,7 @@ class Follower:
         return FamilyPoint(chain, numbers, matrix, condensed, condensed.more[0, :, -1])
 
     def _parameter_derivatives(self, closing: Closing, y, period, parts, place: int) -> np.ndarray:
-        """The derivatives (1, K, 2n, 1) of the ends of the arcs by the parameter at this place."""
+        """Return the derivatives (1, K, 2n, 1) of the ends of the arcs by the parameter at this place."""
         direction = np.eye(len(closing.arcs.numbers))[place][None]
         whole, state = period[0] * self.units.time[0], self.units.state[0]
         spans = whole * parts[0] if self.arcs.driven else np.zeros(len(parts[0]))
@@ -119,7 +126,7 @@ class Follower:
         return by_params[None] * self.of_parameter / state[:, None]
 
     def complete_change(self, point: FamilyPoint, first: np.ndarray, right: float) -> "FamilyUnknowns":
-        """The change of all numbers that the linear equations make of a change `first` (2n + F,) of the free."""
+        """Return the change of all numbers that follows linearly from a change `first` (2n + F,) of the unknowns."""
         states = point.chain.y.shape[2]
         z = np.append(first[states:], right)[None, :, None]
         dy = point.condensed.inner(first[None, :states, None], first[None, :states, None], z)[..., 0]
@@ -129,15 +136,15 @@ class Follower:
         return FamilyUnknowns(dy, first[states : states + 1] if self.period_is_free else np.zeros(1), by)
 
     def move(self, point: FamilyPoint, first: np.ndarray, right: float) -> FamilyPoint:
-        """The point after a change (2n + F,) of its free numbers; the states of its inner arcs follow."""
+        """Return the point after a change (2n + F,) of its unknowns; states of inner arcs change with them."""
         return self.rebuild(point, jax.tree.map(np.add, point.unknowns, self.complete_change(point, first, right)))
 
     def rebuild(self, point: FamilyPoint, whole: "FamilyUnknowns") -> FamilyPoint:
-        """The point with the numbers `whole`, its arcs at the same parts of the period as those of `point`."""
+        """Return the point with the numbers `whole`, its arcs at the same fractions of the period as `point`."""
         return self.point(whole.y, whole.period, point.chain.parts, whole.numbers)
 
     def refine_arcs(self, point: FamilyPoint) -> FamilyPoint:
-        """The point with its orbit in more arcs where errors grow much along one arc; else the point itself."""
+        """Divide the orbit into more arcs if errors grow much along one arc; else return the point itself."""
         count = point.chain.y.shape[1]
         growth = np.log(max(np.linalg.norm(one, 2) for one in point.chain.growth[0])) / np.log(_LONGEST_GROWTH)
         more = int(2 ** np.ceil(np.log2(max(growth, 1.0))))
@@ -146,12 +153,12 @@ class Follower:
         return self.divide_orbit(point.chain.states(), point.chain.periods(), count * more, point.numbers)
 
     def divide_orbit(self, y0: np.ndarray, period: np.ndarray, count: int, numbers: np.ndarray) -> FamilyPoint:
-        """The orbit from a state (1, 2n) with a period (1,), both in the user's units, divided into `count` arcs."""
+        """Divide the orbit from a state (1, 2n) with a period (1,), both in the user's units, into `count` arcs."""
         parts, y = _shooting.guesses(self.closing(numbers), y0, period, count)
         return self.point(y / self.units.state[:, None], period / self.units.time, parts, numbers)
 
     def slope(self, point: FamilyPoint) -> np.ndarray:
-        """The direction (2n + F,), a unit vector, in which the value rises."""
+        """Return the unit vector (2n + F,) along which the value increases."""
         slope = np.zeros(point.matrix.shape[1])
         if self.place is not None:
             slope[-1] = 1.0
@@ -172,9 +179,11 @@ class Follower:
 def tangent_at(
     follower: Follower, point: FamilyPoint, before: FamilyTangent | None, left_out: int = 0
 ) -> FamilyTangent | None:
-    """The direction of the family at a closed orbit, continued from `before`, at first of a rising value; None where
-    the orbit is alone. At a branch point, where the smallest `left_out` singular values are zero, the direction nearest
-    to `before`."""
+    """Return the tangent of the family at a closed orbit, continued from `before`; None if the orbit is isolated.
+
+    Without `before` the value increases along it. At a branch point the smallest `left_out` singular values are zero;
+    the tangent is then the direction nearest to `before`.
+    """
     states = point.matrix.shape[0]
     whole, still = decide(point.matrix, _shooting.RANK), decide(point.matrix[:, :states], _shooting.RANK)
     slope, count, rank = follower.slope(point), states - int(still.rank), int(whole.rank)
@@ -196,7 +205,7 @@ def tangent_at(
 
 
 class FamilyStep(NamedTuple):
-    """A corrected orbit with its tangent, and which share of its bounds the step took, 1 at most."""
+    """A corrected orbit with its tangent, and the largest ratio of the step to its bounds, at most 1."""
 
     point: FamilyPoint
     tangent: FamilyTangent
@@ -206,8 +215,10 @@ class FamilyStep(NamedTuple):
 def correct(
     follower: Follower, point: FamilyPoint, across: FamilyTangent, left_out: int = 0
 ) -> tuple[FamilyPoint, np.ndarray] | None:
-    """The orbit in the plane across a tangent, and the sizes of Newton's corrections; None where there is none. The
-    smallest `left_out` singular values of the equations are left out, as at a branch point, where one is zero."""
+    """Return the orbit in the plane across a tangent, and the sizes of Newton's corrections; None if none is found.
+
+    The smallest `left_out` singular values of the equations are left out, as at a branch point, where one is zero.
+    """
     sizes, before = [], np.inf
     for _ in range(_TRIALS):
         if not point.chain.ok[0] or not point.chain.period[0] > 0:
@@ -224,7 +235,7 @@ def correct(
 
 
 def step_along(follower: Follower, last: FamilyPoint, tangent: FamilyTangent, step: float) -> FamilyStep | None:
-    """The orbit one step on; None where the step was too long for the family."""
+    """Return the orbit one step further; None if the step was too long for the family."""
     there = correct(follower, follower.move(last, step * tangent.vector, 0.0), tangent)
     if there is None:
         return None
@@ -248,7 +259,7 @@ def step_along(follower: Follower, last: FamilyPoint, tangent: FamilyTangent, st
 
 
 def _scaled_chord(follower: Follower, last: FamilyPoint, point: FamilyPoint, step: float) -> np.ndarray:
-    """The change of what is free, (2n + F,), in units of the step."""
+    """Return the change of the unknowns, (2n + F,), in units of the step."""
     change = jax.tree.map(np.subtract, point.unknowns, last.unknowns)
     period = change.period if follower.period_is_free else []
     parameter = [] if follower.place is None else change.numbers[[follower.place]] / follower.of_parameter
@@ -256,6 +267,6 @@ def _scaled_chord(follower: Follower, last: FamilyPoint, point: FamilyPoint, ste
 
 
 def next_step(step: float, there: FamilyStep) -> float:
-    """The length of the next step: half to twice this one, so that it takes the usual share of its bounds."""
+    """Return the length of the next step, half to twice this one, for the usual ratio to its bounds."""
     longer = step * float(np.clip(_USUAL / max(there.share, 1e-300), 0.5, 2.0))
     return min(longer, _LONGEST_STEP * there.point.chain.size()[0])

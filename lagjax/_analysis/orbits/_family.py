@@ -139,8 +139,11 @@ def _parameter_index(params: PyTree, name: str) -> int:
 
 
 class _Member(NamedTuple):
-    """An orbit of a family: `found` (of one orbit), the number of its `symmetries`, and `tests` (4,) that change sign
-    at a fold, at a branch point or fold, at a doubling, and at the value where the family ends."""
+    """An orbit of a family: `found` (of one orbit), the number of its `symmetries`, and test functions.
+
+    `tests` (4,) change sign at a fold, at a branch point or fold, at a doubling, and at the value where the family
+    ends.
+    """
 
     point: FamilyPoint
     tangent: FamilyTangent
@@ -151,7 +154,7 @@ class _Member(NamedTuple):
 
 
 def _build_member(follower: Follower, point: FamilyPoint, tangent: FamilyTangent, most: int | None) -> _Member:
-    """An orbit with its multipliers; at most `most` directions count as symmetries."""
+    """Return an orbit with its multipliers; at most `most` directions count as symmetries."""
     (symmetries,) = _shooting.symmetries(point.chain, most)
     count = symmetries.null.shape[2]
     found = assess_orbits(follower.closing(point.numbers), point.chain, count)
@@ -191,13 +194,13 @@ def _follow_family(follower: Follower, y0, period, step: float, count: int) -> t
 
 
 def _first_point(follower: Follower, y0: np.ndarray, period: np.ndarray, numbers: np.ndarray) -> FamilyPoint:
-    """The orbit at which a family begins, in as many arcs as its steps and its growth need."""
+    """Return the orbit at which a family begins, in as many arcs as its steps and its growth need."""
     count = int(arc_counts(follower.arcs.with_numbers(numbers), y0, period)[0])
     return follower.refine_arcs(follower.divide_orbit(y0, period, count, numbers))
 
 
 def _refine_member(follower: Follower, member: _Member) -> _Member:
-    """The member with its orbit in more arcs where errors grow much along one arc; else the member itself."""
+    """Divide the member's orbit into more arcs if errors grow much along one; else return the member itself."""
     if (point := follower.refine_arcs(member.point)) is member.point:
         return member
     there = correct(follower, point, member.tangent)
@@ -224,7 +227,7 @@ _BESIDE, _BRACKET = 0.02, 1e-3
 
 
 def _locate_events(follower: Follower, last: _Member, following: _Member, step: float) -> list[_Member]:
-    """The folds, branch points and doublings between two orbits, in their order, up to where the family is to end."""
+    """Return the folds, branch points and doublings between two orbits, in order, up to the end of the family."""
     turned = (last.tests * following.tests < 0) & (np.maximum(abs(last.tests), abs(following.tests)) > _NOISE)
     located = {k: _locate_event(follower, last, following, step, k) for k in np.flatnonzero(turned).tolist()}
     if 0 in located and 1 in located and abs(located[0][0] - located[1][0]) < _SAME * step:
@@ -234,9 +237,11 @@ def _locate_events(follower: Follower, last: _Member, following: _Member, step: 
 
 
 def _locate_event(follower: Follower, last: _Member, following: _Member, step: float, k: int) -> tuple[float, _Member]:
-    """The zero of test k on the arc between two orbits, and the orbit there. About a branch point Newton's method finds
-    orbits of either family: so orbits are computed beside it, ever nearer, from cubic guesses; that at the zero is
-    interpolated and corrected in all directions but the singular one."""
+    """Return the arc length of the zero of test k between two orbits, and the orbit there.
+
+    Near a branch point Newton's method finds orbits of either family: so orbits are computed beside it, ever nearer,
+    from cubic guesses; that at the zero is interpolated and corrected in all directions but the singular one.
+    """
     across, found = last.tangent, {0.0: last, step: following}
     a, b = 0.0, step
     while b - a > _BRACKET * step:
@@ -257,7 +262,7 @@ def _locate_event(follower: Follower, last: _Member, following: _Member, step: f
 
 
 def _interpolate_zero(found: dict[float, _Member], a: float, b: float, k: int) -> float:
-    """The zero of the inverse polynomial through the four orbits nearest to a bracket; within it in any case."""
+    """Return the zero of the inverse polynomial through the four orbits nearest to a bracket, within the bracket."""
     near = sorted(found, key=lambda s: abs(s - (a + b) / 2))[:4]
     values = [found[s].tests[k] for s in near]
     shares = [np.prod([w / (w - v) for w in values[:j] + values[j + 1 :]]) for j, v in enumerate(values)]
@@ -271,7 +276,7 @@ def _orbit_between(
     follower: Follower, found: dict[float, _Member], a: float, b: float, s: float, across: FamilyTangent, left_out: int,
     most: int,
 ) -> _Member | None:  # fmt: skip
-    """The orbit at arc length s between members of `found` at a and b; None where it belongs to another family."""
+    """Return the orbit at arc length s between members of `found` at a and b; None if it is of another family."""
     u, width = (s - a) / (b - a), b - a
     shares = (1 + 2 * u) * (1 - u) ** 2, u**2 * (3 - 2 * u), width * u * (1 - u) ** 2, width * u**2 * (u - 1)
     ends = (found[x].point.unknowns for x in (a, b))
@@ -359,15 +364,17 @@ def branch_off(
 
 
 def _orbit_start(family: Family, k: int, turns: int) -> tuple[np.ndarray, np.ndarray, Layout]:
-    """The first state (1, 2n) of orbit k and its period (1,), traversed `turns` times, and the layout of the state."""
+    """Return the first state (1, 2n) of orbit k and its period (1,) times `turns`, and the layout."""
     q0, qdot0 = jax.tree.map(lambda x: x[k], (family.q0, family.qdot0))
     period, layout, y0 = starts(q0, qdot0, turns * family.period[k], "period")
     return y0, period.ravel(), layout
 
 
 def _branching_orbit(follower: Follower, here: FamilyPoint, before: FamilyTangent, size: float) -> FamilyPoint | None:
-    """The orbit at a distance from a branch point along the null vector that is neither a symmetry nor of the old
-    family. Symmetries are known from a neighbour: at the branch point singular values do not tell."""
+    """Return the orbit at a distance from a branch point along the null vector of the other family.
+
+    Symmetries are known from a neighbour: at the branch point singular values do not distinguish them.
+    """
     states, count = here.matrix.shape[0], before.symmetries.shape[1]
     still = decide(here.matrix[:, :states]).right[:, states - count - 1 :]
     null = decide(here.matrix).right[:, before.rank - 1 :]

@@ -24,15 +24,17 @@ UNCERTAIN = 1e-3
 
 
 class Reduced(NamedTuple):
-    """The arcs without the known ones: `growth` (K, m, m), and how many multipliers are 1 by symmetry."""
+    """The arcs restricted to unknown multipliers, `growth` (K, m, m), and the number of those known to be 1."""
 
     growth: np.ndarray
     known: int
 
 
 def reduce(growth: np.ndarray, null: np.ndarray, of_transpose: np.ndarray) -> Reduced:
-    """The arcs `growth` (K, 2n, 2n) of a closed chain, restricted to ker ℓ / W; as they are where W is empty. W =
-    `null` and ℓ = `of_transpose`, both (K, 2n, k)."""
+    """Restrict arcs `growth` (K, 2n, 2n) of a closed chain to ker ℓ / W, W = `null` and ℓ = `of_transpose`.
+
+    Both are (K, 2n, k); where W is empty, the arcs stay as they are.
+    """
     count, states, _ = growth.shape
     if not null.shape[2]:
         return Reduced(growth, 0)
@@ -45,7 +47,7 @@ def reduce(growth: np.ndarray, null: np.ndarray, of_transpose: np.ndarray) -> Re
 
 
 def _quotient_basis(null: np.ndarray, of_transpose: np.ndarray) -> np.ndarray:
-    """An orthonormal basis (2n, m) of the part of ker ℓ that is orthogonal to W ∩ ker ℓ."""
+    """Return an orthonormal basis (2n, m) of the part of ker ℓ that is orthogonal to W ∩ ker ℓ."""
     w, ell = np.linalg.qr(null)[0], np.linalg.qr(of_transpose)[0]
     # Directions of W that ℓ does not see; those it sees are simple multipliers, outside of ker ℓ.
     inside = w @ decide(ell.T @ w, absolute=_SEEN).null
@@ -56,7 +58,7 @@ _SEEN = 1e-5  # the cosine of W and ℓ that tells a simple multiplier 1 from a 
 
 
 def multipliers_of(reduced: Reduced, paired: bool) -> np.ndarray:
-    """All 2n multipliers, the largest first; `paired` puts each beside its reciprocal."""
+    """Return all 2n multipliers, the largest first; `paired` puts each beside its reciprocal."""
     m = reduced.growth.shape[1]
     values = _product_eigenvalues(reduced.growth) if m else np.zeros(0, complex)
     values = values[np.argsort(-np.abs(values), kind="stable")]
@@ -64,8 +66,10 @@ def multipliers_of(reduced: Reduced, paired: bool) -> np.ndarray:
 
 
 def passage_determinant(reduced: Reduced, sign: int) -> float:
-    """det(1 − sign·G_(K−1) … G_0): zero where a multiplier passes through 1 (`sign` 1) or −1. It is that of the cyclic
-    matrix, known to all digits where two multipliers that meet are known to half of them."""
+    """Return det(1 − sign·G_(K−1) … G_0): zero where a multiplier passes through 1 (`sign` 1) or −1.
+
+    It is that of the cyclic matrix, accurate to all digits where two multipliers that meet are known to half of them.
+    """
     growth = reduced.growth.copy()
     growth[0] *= sign
     cyclic = _cyclic_matrix(growth)
@@ -73,7 +77,7 @@ def passage_determinant(reduced: Reduced, sign: int) -> float:
 
 
 def _cyclic_matrix(growth: np.ndarray) -> np.ndarray:
-    """The matrix (K m, K m) with blocks G_k (K, m, m), each of which takes part k to the part after it."""
+    """Return the matrix (K m, K m) with blocks G_k (K, m, m), each of which maps part k to the next part."""
     count, m, _ = growth.shape
     cyclic = np.zeros((count, m, count, m))
     for k in range(count):
@@ -82,13 +86,13 @@ def _cyclic_matrix(growth: np.ndarray) -> np.ndarray:
 
 
 def pairing_error(multipliers: np.ndarray) -> float:
-    """max |μᵢ μᵢ₊₁ − 1| over the pairs of neighbours in the result of `multipliers_of`, which are reciprocals."""
+    """Return max |μᵢ μᵢ₊₁ − 1| over pairs of neighbours in the result of `multipliers_of`."""
     firsts, seconds = multipliers[0::2], multipliers[1::2]
     return float(np.abs(firsts[: len(seconds)] * seconds - 1).max(initial=0.0))
 
 
 def _product_eigenvalues(growth: np.ndarray) -> np.ndarray:
-    """The eigenvalues of G_(K−1) … G_0, as K-th powers of those of the cyclic matrix that has them as its blocks."""
+    """Return the eigenvalues of G_(K−1) … G_0, as K-th powers of those of the cyclic matrix of these blocks."""
     growth = _merge_factors(growth)
     count, roots = len(growth), np.linalg.eigvals(_cyclic_matrix(growth)).astype(complex)
     if count == 1:
@@ -98,7 +102,7 @@ def _product_eigenvalues(growth: np.ndarray) -> np.ndarray:
 
 
 def _merge_factors(growth: np.ndarray) -> np.ndarray:
-    """Fewer factors of the same product, neighbours multiplied while that grows little: eigenvalues cost their cube."""
+    """Multiply neighbouring factors while their product stays small: fewer factors of the same product."""
     merged = [growth[0]]
     for matrix in growth[1:]:
         product = matrix @ merged[-1]
@@ -113,7 +117,7 @@ _LITTLE = 100.0
 
 
 def _group_means(powers: np.ndarray, count: int) -> np.ndarray:
-    """Means of the groups of `count` values that belong to one multiplier each."""
+    """Return the mean of each group of `count` values that belong to one multiplier."""
     means, rest = [], powers[np.argsort(-np.abs(powers), kind="stable")]
     while len(rest):
         near = np.argsort(np.abs(rest - rest[0]), kind="stable")
@@ -123,7 +127,7 @@ def _group_means(powers: np.ndarray, count: int) -> np.ndarray:
 
 
 def _pair_reciprocals(values: np.ndarray) -> np.ndarray:
-    """The values (m,) in an order where each is followed by the one nearest to its reciprocal."""
+    """Order the values (m,) so that each is followed by the one nearest to its reciprocal."""
     left, ordered = list(values), []
     while left:
         first = left.pop(0)

@@ -1,6 +1,6 @@
-"""Motions that jump, with contacts or from mode to mode, on rows as `Arcs` asks for them.
+"""Integrates many motions with contacts or modes, for `Arcs`.
 
-They are followed under `jax.vmap`, and vary by forward mode: a round for all rows at once.
+They are simulated under `jax.vmap`, with derivatives by forward mode: in one call for all rows.
 """
 
 import dataclasses
@@ -22,8 +22,10 @@ _CHANGES, _CHANGES_OF_ARC = 4096, 256
 
 
 class JumpRun(NamedTuple):
-    """R motions: as in a `Solution` `path` (R, T, 2n), `y_end`, `t_end`, `result`, `accepted`; and `modes` (R, T).
-    `by_start` (R, 2n, 2n) and `rate` (R, 2n) are the derivatives of `y_end` by the start and by the last time."""
+    """R motions: `path` (R, T, 2n), `y_end`, `t_end`, `result`, `accepted` as in a `Solution`; and `modes` (R, T).
+
+    `by_start` (R, 2n, 2n) and `rate` (R, 2n) are the derivatives of `y_end` by the start and by the last time.
+    """
 
     path: Any
     y_end: Any
@@ -36,7 +38,7 @@ class JumpRun(NamedTuple):
 
 
 class JumpingMotions(NamedTuple):
-    """The follower of motions of one scene that jumps."""
+    """Integrates motions of one scene that jumps."""
 
     scene: Scene
     layout: Layout
@@ -51,7 +53,7 @@ class JumpingMotions(NamedTuple):
         return any("t" in function.extras for function in functions if isinstance(function, Function))
 
     def run(self, times: np.ndarray, y0: np.ndarray, modes=None, varies: bool = False) -> JumpRun:
-        """The motions from y0 (R, 2n) in `modes` (R,), by default the first one, at `times` (R, T) or (1, T)."""
+        """Integrate from y0 (R, 2n) in `modes` (R,), by default the first one, at `times` (R, T) or (1, T)."""
         rows, scene = len(y0), self.scene
         if modes is None:
             modes = np.full(rows, scene.first if isinstance(scene, Hybrid) else 0)

@@ -1,9 +1,9 @@
-"""Lyapunov exponents: how fast motions part that begin side by side.
+"""Lyapunov exponents: the mean rates at which neighbouring motions diverge.
 
 The whole spectrum follows from derivatives of short arcs, which are rows of one run, in canonical coordinates: there
-they are symplectic, and in the order (q1 … qn, pn … p1) their QR decompositions are Iwasawa's, whose diagonals hold
+they are symplectic, and in the order (q1 … qn, pn … p1) their QR decompositions are Iwasawa's, whose diagonals contain
 numbers and their inverses. So exponents come in pairs ±λ at every time, and not in the limit alone. The largest by
-itself follows from one tangent that moves along with the motion, as more coordinates of it.
+itself follows from one tangent that is integrated with the motion, as additional coordinates.
 
 Source: Benettin, Galgani, Giorgilli & Strelcyn, *Lyapunov characteristic exponents for smooth dynamical systems and for
 Hamiltonian systems*, Meccanica 15 (1980) 9; Leimkuhler & Van Vleck, *Orthosymplectic integration of linear Hamiltonian
@@ -101,7 +101,7 @@ def lyapunov_spectrum(
 
 
 def _lyapunov_spectra(arcs: Arcs, y0: np.ndarray, duration: np.ndarray, pieces: int) -> np.ndarray:
-    """The exponents (N, 2n) of some motions, each from this many arcs."""
+    """Return the exponents (N, 2n) of N motions from y0 (N, 2n), each divided into this many arcs."""
     members, states = y0.shape
     times = duration[:, None] * np.arange(pieces + 1) / pieces
     run: Any = arcs.ends(times, y0)

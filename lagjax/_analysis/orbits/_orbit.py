@@ -1,4 +1,4 @@
-"""`periodic_orbit`: motions that return to where they began, from guesses of their start and period."""
+"""`periodic_orbit`: periodic motions, from guesses of their start and period."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -150,7 +150,7 @@ def restore_orbits(layout: Layout, found: "FlatOrbits", message: str | tuple[str
 
 
 def _closing_conditions(arcs: Arcs, energy, image) -> Closing:
-    """The conditions on an orbit. Raises for an energy that is no number, and an image that is not affine."""
+    """Return the conditions on an orbit; raise if the energy is no number, or the image is not affine."""
     if energy is not None:
         require_number(energy, "energy")
         require_finite(energy, "energy")
@@ -190,7 +190,7 @@ class FlatOrbits(NamedTuple):
 
 
 def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrbits:
-    """The orbits near these guesses; what does not close well is tried with more arcs as long as that helps."""
+    """Return the orbits near these guesses; one that does not close well is tried with more arcs while that helps."""
     arcs = closing.arcs
     counts = arc_counts(arcs, y0, period)
     most = counts if arcs.jumping else np.minimum(MOST_ARCS, _MORE * counts)
@@ -214,7 +214,7 @@ def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrbits:
 
 
 def arc_counts(arcs: Arcs, y0, period) -> np.ndarray:
-    """The number of arcs of each orbit, a power of two: from the steps that its guess takes."""
+    """Return the number of arcs of each orbit, a power of two, from the number of steps of its guess."""
     if arcs.jumping:  # a state between does not tell the mode
         return np.ones(len(period), int)
     run = arcs.ends(np.stack([np.zeros(len(period)), period], axis=1), y0)
@@ -224,8 +224,10 @@ def arc_counts(arcs: Arcs, y0, period) -> np.ndarray:
 
 
 def assess_orbits(closing: Closing, chain: Chain, most: int | None = None) -> FlatOrbits:
-    """The orbits that the chains of a search are, with multipliers and a sentence where one is none; at most `most`
-    directions count as symmetries, None for all that monodromy − 1 sends to zero."""
+    """Return the orbits of the chains, with multipliers, and a message for each chain that is no orbit.
+
+    At most `most` directions count as symmetries, None: the whole null space of monodromy − 1.
+    """
     message = np.array([_explain_no_orbit(chain, k) for k in range(len(chain.period))], object)
     ok = np.array([not text for text in message])
     multipliers = np.full((len(ok), chain.y.shape[2]), np.nan, complex)

@@ -1,18 +1,19 @@
-"""`action` and `find_path`: the path between two configurations, what its action is, and whether that is least.
+"""`action` and `find_path`: the path between two configurations, its action, and whether that is a minimum.
 
-A path of Hamilton's principle joins q_start at one time to q_end at another. It is found by the multiple shooting
-of `_shooting`: states at equal parts of the time, joined by motions, with q given at both ends. Whether its action is
-a minimum is told by conjugate points, where neighbouring paths from the same start meet again: as many as there are on
-the way, as many independent variations lower the action (Morse).
+A path of Hamilton's principle joins q_start at one time to q_end at another. It is found by the multiple shooting of
+`_shooting`: states at equal parts of the time, joined by motions, with q given at both ends. Its action is a minimum if
+there are no conjugate points, where neighbouring paths from the same start meet again: as many as there are on the way,
+as many independent variations lower the action (Morse).
 
-The paths from one start with all velocities are a Lagrangian plane, (∂q/∂q̇₀, ∂p/∂q̇₀) = (B, D), and a time is conjugate
-where B is singular, as often as its rank falls. To look for zeros of det B would miss double ones, such as those of an
-oscillator that is the same in two directions. The eigenvalues of the unitary matrix (D + iB)(D − iB)⁻¹ turn all in one
-sense through 1 where that happens, if M is positive definite, so that none is missed and each counts as often as it is.
+The paths from one start with all velocities are a Lagrangian plane, (∂q/∂q̇₀, ∂p/∂q̇₀) = (B, D), and a time is
+conjugate where B is singular, as often as its rank falls. To look for zeros of det B would miss double ones, such as
+those of an oscillator that is the same in two directions. The eigenvalues of the unitary matrix (D + iB)(D − iB)⁻¹ turn
+all in one sense through 1 where that happens, if M is positive definite, so that none is missed and each counts as
+often as it is.
 
 Source: Gelfand & Fomin, *Calculus of Variations*, §26–29; Milnor, *Morse Theory*, §15; Stoer & Bulirsch, §7.3.5;
-Arnold, *On a characteristic class entering in quantization conditions*, Funct. Anal. Appl. 1 (1967) 1;
-Duistermaat, *On the Morse index in variational calculus*, Adv. Math. 21 (1976) 173.
+Arnold, *On a characteristic class entering in quantization conditions*, Funct. Anal. Appl. 1 (1967) 1; Duistermaat, *On
+the Morse index in variational calculus*, Adv. Math. 21 (1976) 173.
 """
 
 from collections.abc import Callable
@@ -115,7 +116,7 @@ def action(system: System, path: Trajectory | Callable, t_start=None, t_end=None
 
 
 def _states_of_motion(system: System, path: Trajectory, params) -> tuple[np.ndarray, Callable]:
-    """The times of outputs, and what gives (q, q̇) of a motion at times between."""
+    """Return the output times of a trajectory, and a function that computes (q, q̇) at times between."""
     q, qdot = jax.tree.map(lambda x: x[0], (path.q, path.qdot))
 
     def states(times):
@@ -126,7 +127,7 @@ def _states_of_motion(system: System, path: Trajectory, params) -> tuple[np.ndar
 
 
 def _states_of_function(path, t_start, t_end) -> tuple[np.ndarray, Callable]:
-    """The edges of equal parts of the time, and what gives (q, q̇) of a function of the time."""
+    """Return the edges of equal parts of the time, and a function that gives (q, q̇) of `path` at times."""
     if not callable(path):
         raise TypeError(f"path must be a Trajectory, or a function of the time; got {type(path).__name__}.")
     for value, name in ((t_start, "t_start"), (t_end, "t_end")):
@@ -139,7 +140,7 @@ def _states_of_function(path, t_start, t_end) -> tuple[np.ndarray, Callable]:
 
 
 def _action_integral(lagrangians: Callable, edges: np.ndarray) -> tuple[Any, Any]:
-    """∫ L dt and ∫ |L| dt over panels between these edges; `lagrangians` are L at times (T,)."""
+    """Return ∫ L dt and ∫ |L| dt over the intervals between these edges; `lagrangians` gives L at times (T,)."""
     half = np.diff(edges)[:, None] / 2
     times = edges[:-1, None] + half * (1 + _NODES)
     values = lagrangians(times.ravel()).reshape(times.shape) * half
@@ -201,7 +202,7 @@ def find_path(
 
 
 def _path_units(arcs: Arcs, y, ends, times) -> Units:
-    """The units of the first state, (1, 2n), with the farther one of both ends as the size of q."""
+    """Return the units of the first state, (1, 2n), with the farther one of both ends as the size of q."""
     n, duration, farther = arcs.size, times[-1:] - times[:1], np.abs(ends).max(axis=0)
     velocity = np.maximum(np.abs(y[0, n:]), np.abs(ends[1] - ends[0]) / duration)
     here = arcs.units(y[:1], duration)
@@ -211,7 +212,7 @@ def _path_units(arcs: Arcs, y, ends, times) -> Units:
 
 
 def _guess_states(layout: Layout, guess, ends, times) -> np.ndarray:
-    """The guessed states (K, 2n) at the first times of the arcs."""
+    """Return the guessed states (K, 2n) at the first times of the arcs."""
     q_start, q_end = ends
     if guess is None:
         slope = (q_end - q_start) / (times[-1] - times[0])
@@ -259,7 +260,7 @@ def _build_path(system: System, arcs: Arcs, chain: Chain, q_start: np.ndarray, t
 
 
 def _arc_action(arcs: Arcs, y, t_first, t_last) -> float:
-    """∫ L dt along one arc, on eight panels."""
+    """Return ∫ L dt along one arc, on eight intervals."""
 
     def lagrangians(times):
         path = arcs.ends(np.append(t_first, times)[None], y[None]).path[0, 1:]
@@ -276,8 +277,10 @@ _AT_END = 1e-9  # of the time: a conjugate time so near to the end counts as the
 
 
 def _conjugate_times(arcs: Arcs, y: np.ndarray, times: np.ndarray, units: Units) -> tuple[np.ndarray, bool]:
-    """The conjugate times (k,) before the last time, ascending, and whether the last time is one. The path is arcs from
-    states `y` (K, 2n) at `times` (K + 1,); tangents are in the `units` (1, 2n) of states."""
+    """Return the conjugate times (k,) before the last time, ascending, and whether the last time is one.
+
+    The path is arcs from states `y` (K, 2n) at `times` (K + 1,); tangents are in the `units` (1, 2n) of states.
+    """
     n, found, duration = arcs.size, [], times[-1] - times[0]
     frame = np.concatenate([np.zeros((n, n)), np.eye(n)])  # (δq, δq̇) of all velocities
     for k, start in enumerate(y):
@@ -295,7 +298,7 @@ def _conjugate_times(arcs: Arcs, y: np.ndarray, times: np.ndarray, units: Units)
 
 
 def _tangent_frames(arcs: Arcs, start, ts, frame, units: Units) -> np.ndarray:
-    """The tangents (T, 2n, n) at times (T,) that begin as `frame` at the first one."""
+    """Return the tangents (T, 2n, n) at times (T,) that begin as `frame` at the first one."""
     times = np.stack([np.full(len(ts) - 1, ts[0]), ts[1:]], axis=1)
     arc = arcs.follow(times, np.repeat(start[None], len(times), axis=0))
     # The plane is what counts: its vectors are made orthonormal, so that none outgrows the others.
@@ -303,7 +306,7 @@ def _tangent_frames(arcs: Arcs, start, ts, frame, units: Units) -> np.ndarray:
 
 
 def _plane_phases(arcs: Arcs, y, t, frames, units: Units) -> np.ndarray:
-    """The phases (T, n), ascending in [0, 2π), of the unitary matrices of planes (T, 2n, n) at states y (T, 2n)."""
+    """Return the phases (T, n), ascending in [0, 2π), of the unitary matrices of planes (T, 2n, n) at y (T, 2n)."""
     n = arcs.size
     canonical = np.linalg.qr(arcs.canonical(t, y, units) @ frames)[0]
     b, d = canonical[:, :n], canonical[:, n:]
@@ -316,13 +319,13 @@ def _states_on_arcs(arcs: Arcs, start, ts) -> np.ndarray:
 
 
 def _count_turns(before: np.ndarray, after: np.ndarray) -> int:
-    """The number of phases that passed 2π between two sets of n that lie near each other on the circle."""
+    """Return how many phases passed 2π between two sets of n that lie near each other on the circle."""
     shifts = [np.concatenate([after[k:], after[:k] + 2 * np.pi]) - before for k in range(len(before) + 1)]
     return int(np.argmin([np.abs(shift).max() for shift in shifts]))
 
 
 def _locate_conjugate_time(arcs: Arcs, start, t_first, low, high, frame, frame_low, nth: int, units: Units) -> float:
-    """The time of the nth conjugate time between `low` and `high`, counted from 0, by bisection."""
+    """Return the nth conjugate time, counted from 0, between `low` and `high`, by bisection."""
     state = _states_on_arcs(arcs, start, np.array([t_first, low]))[-1:] if low > t_first else start[None]
     before = _plane_phases(arcs, state, np.array([low]), frame_low[None], units)[0]
     for _ in range(_TRIALS):

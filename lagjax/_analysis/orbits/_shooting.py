@@ -39,8 +39,10 @@ _ENOUGH = 8e-15  # of the size of the state: round-off, below which trials canno
 
 
 class Closing(NamedTuple):
-    """The conditions on the ends: those of an orbit are S y = `matrix` y + `shift`, and an energy if given. Those of a
-    path are the given positions: `q_end` (n,), and the one it begins with, at the time `t_first`."""
+    """The conditions on both ends of a chain. An orbit has S y = `matrix` y + `shift`, and an energy if given.
+
+    A path has the given positions: `q_end` (n,), and the one it begins with, at the time `t_first`.
+    """
 
     arcs: Arcs
     matrix: np.ndarray
@@ -55,25 +57,25 @@ class Closing(NamedTuple):
 
     @property
     def lasts(self) -> bool:
-        """True if the duration is given: that of a path, and the period of what is driven."""
+        """True if the duration is given: that of a path, and the period of a driven scene."""
         return self.arcs.driven or self.q_end is not None
 
     def free(self) -> tuple[np.ndarray, np.ndarray]:
-        """E and F (2n, 2n): the first state changes by E u and the last by F u, u (2n,) being free."""
+        """E and F (2n, 2n): the unknowns u (2n,) change the first state by E u and the last by F u."""
         whole, n = np.eye(2 * self.arcs.size), self.arcs.size
         if self.q_end is None:
             return whole, whole
         return np.roll(whole, n, axis=0) * (np.arange(2 * n) < n), whole * (np.arange(2 * n) >= n)
 
     def target(self, y: np.ndarray, end: np.ndarray, of_state: np.ndarray) -> np.ndarray:
-        """The states (B, K, 2n) where arcs from `y` that end at `end` should end, all in units `of_state` (B, 2n)."""
+        """Return the states (B, K, 2n) where arcs from `y` that end at `end` should end, in units of (B, 2n)."""
         target, n = np.roll(y, -1, axis=1), self.arcs.size
         if self.q_end is not None:
             target[:, -1] = np.concatenate([self.q_end / of_state[:, :n], end[:, -1, n:]], axis=1)
         return target
 
     def conditions(self, y0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The error of the energy of first states (B, 2n), (B, m), and its slopes (B, m, 2n); m is 0 or 1."""
+        """Return the energy error of first states (B, 2n), (B, m), and its gradient (B, m, 2n); m is 0 or 1."""
         if self.energy is None:
             return np.zeros((len(y0), 0)), np.zeros((len(y0), 0, y0.shape[1]))
         off = self.arcs.energy(0.0, y0) - self.energy
@@ -81,13 +83,12 @@ class Closing(NamedTuple):
 
 
 class Chain(NamedTuple):
-    """B closed chains of K arcs: states `y` (B, K, 2n) at `parts` (B, K + 1) of the periods `period` (B,).
+    """B chains of K arcs: states `y` (B, K, 2n) at fractions `parts` (B, K + 1) of the periods `period` (B,).
 
-    All is in the `units` of each chain, in which metres and seconds do not matter.
-    `defect` (B, K, 2n) is end of an arc minus the next state, `growth` (B, K, 2n, 2n) the derivatives of the arcs,
-    `rate` (B, K, 2n) that of the ends in time; those of the last arc are taken back by S. `off` (B, m) and `slope`
-    (B, m, 2n) are conditions on the first state. `ok` (B,) tells whether all arcs could be followed, and `why` (B,), of
-    text, why not.
+    All is in the `units` of each chain, so that the user's units do not matter. `defect` (B, K, 2n) is the end of an
+    arc minus the next state, `growth` (B, K, 2n, 2n) the derivatives of the arcs, `rate` (B, K, 2n) that of the ends in
+    time; those of the last arc are multiplied by S⁻¹. `off` (B, m) and `slope` (B, m, 2n) are conditions on the first
+    state. `ok` (B,): True if all arcs were integrated; `why` (B,), of text, why not.
     """
 
     y: np.ndarray
@@ -103,33 +104,33 @@ class Chain(NamedTuple):
     why: np.ndarray
 
     def states(self) -> np.ndarray:
-        """The first states (B, 2n) in the units of the user."""
+        """Return the first states (B, 2n) in the units of the user."""
         return self.y[:, 0] * self.units.state
 
     def periods(self) -> np.ndarray:
-        """The periods (B,) in the unit of the user."""
+        """Return the periods (B,) in the unit of the user."""
         return self.period * self.units.time
 
     def size(self) -> np.ndarray:
-        """The largest number of a state, (B,)."""
+        """Return the largest number of a state, (B,)."""
         return np.abs(self.y).max(axis=(1, 2))
 
     def closure(self) -> np.ndarray:
-        """The largest defect of each chain, (B,)."""
+        """Return the largest defect of each chain, (B,)."""
         return np.where(self.ok, np.abs(self.defect).max(axis=(1, 2)), np.inf)
 
     def merit(self) -> np.ndarray:
-        """The closure together with how far the first state is from its conditions, (B,)."""
+        """Return the larger of the closure and the violation of the conditions on the first state, (B,)."""
         steep = np.maximum(np.abs(self.slope).max(axis=2, initial=0.0), 1e-300)
         return np.maximum(self.closure(), np.max(np.abs(self.off) / steep, axis=1, initial=0.0))
 
     def select(self, chosen: np.ndarray) -> "Chain":
-        """The chains at `chosen`: indices, or a mask (B,)."""
+        """Return the chains at `chosen`: indices, or a mask (B,)."""
         return jax.tree.map(lambda x: x[chosen], self)
 
 
 def replace_members(members: Members, places: np.ndarray, others: Members) -> Members:
-    """The `members`, arrays with these as first axis, with those at indices `places` replaced by `others`."""
+    """Replace the members at indices `places` by `others`, in arrays with a first axis of members."""
 
     def replace(x: np.ndarray, new: np.ndarray) -> np.ndarray:
         x = x.copy()
@@ -140,8 +141,10 @@ def replace_members(members: Members, places: np.ndarray, others: Members) -> Me
 
 
 def guesses(closing: Closing, y0: np.ndarray, period: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Parts (B, K + 1) of the period and states (B, K, 2n) there, from starts (B, 2n): from both sides to the middle. K
-    is a power of two. A driven motion that does not close has no past: it is followed forward only."""
+    """Return fractions (B, K + 1) of the period and states (B, K, 2n) there, from starts (B, 2n).
+
+    The motion is integrated from both ends to the middle, if the scene is not driven. K is a power of two.
+    """
     arcs = closing.arcs
     if count == 1:
         return np.broadcast_to([0.0, 1.0], (len(y0), 2)), y0[:, None].copy()
@@ -157,7 +160,7 @@ def guesses(closing: Closing, y0: np.ndarray, period: np.ndarray, count: int) ->
 
 
 def follow(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray, units: Units) -> Chain:
-    """The chains through these states, (B, K, 2n), all in these units."""
+    """Integrate the arcs from these states, (B, K, 2n), all in these units: a `Chain`."""
     arcs, (chains, count, states) = closing.arcs, y.shape
     of_state, spans = units.state[:, None], (period * units.time)[:, None]
     times = closing.t_first + np.stack([spans * parts[:, :-1], spans * parts[:, 1:]], axis=2).reshape(-1, 2)
@@ -183,8 +186,10 @@ def follow(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarra
 
 
 class NewtonEquations(NamedTuple):
-    """The equations of Newton's method for B chains: condensed to both ends, with the rank decided. The unknowns are u
-    (2n,) of `Closing.free`, and the period where it is free; `right` (B, 2n + m)."""
+    """Newton's equations of B chains, condensed to both ends, with the rank decided; `right` (B, 2n + m).
+
+    The unknowns are u (2n,) of `Closing.free`, and the period if it is free.
+    """
 
     condensed: Condensed
     decided: Decided
@@ -210,8 +215,7 @@ def equations(closing: Closing, chain: Chain) -> NewtonEquations:
 
 
 def correction(closing: Closing, chain: Chain) -> tuple[np.ndarray, np.ndarray]:
-    """Newton's step, shortest in the first state and the period: dy (B, K, 2n), dT (B,); 0 for conjugate ends of a
-    path."""
+    """Return the Newton step of least norm: dy (B, K, 2n), dT (B,); 0 if the ends of a path are conjugate."""
     condensed, decided, right = equations(closing, chain)
     step, states = -decided.least_norm(right), chain.y.shape[2]
     period = np.zeros(len(step)) if closing.lasts else step[:, -1]
@@ -224,7 +228,7 @@ def correction(closing: Closing, chain: Chain) -> tuple[np.ndarray, np.ndarray]:
 
 
 def close(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray, units: Units) -> Chain:
-    """The closed chains, or joined paths, near these states, as far as they are found: look at `Chain.closure`."""
+    """Find the closed chains, or joined paths, near these states; `Chain.closure` is the remaining error."""
     chain = follow(closing, y / units.state[:, None], period / units.time, parts, units)
     active = chain.ok.copy()
     for _ in range(_TRIALS):
@@ -240,7 +244,7 @@ def close(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray
 
 
 def _damped_newton_step(closing: Closing, chain: Chain) -> Chain:
-    """Each chain after the largest fraction of a Newton step that lowers its defect."""
+    """Return each chain after the largest fraction of a Newton step that lowers its defect."""
     dy, dperiod = correction(closing, chain)
     longest = np.minimum(1.0, 0.25 * chain.period / np.maximum(np.abs(dperiod), 1e-300))
     best, waiting = chain, np.arange(len(chain.period))
@@ -265,8 +269,10 @@ class Symmetries(NamedTuple):
 
 
 def symmetries(chain: Chain, most: int | None = None) -> list[Symmetries]:
-    """The null spaces of closed chains, at most `most` directions: those of the smallest singular values, as a branch
-    point has more by chance."""
+    """Return the null spaces of closed chains, of at most `most` dimensions, by the smallest singular values.
+
+    A branch point has one more dimension than the symmetries, which `most` excludes.
+    """
     forward, null = _closure_null_vectors(chain.growth)
     # ℓ_k = G_kᵀ ℓ_(k+1): the same chain, walked back from the end.
     back, of_transpose = _closure_null_vectors(np.swapaxes(chain.growth[:, ::-1], 2, 3))
@@ -279,7 +285,7 @@ def symmetries(chain: Chain, most: int | None = None) -> list[Symmetries]:
 
 
 def _closure_null_vectors(growth: np.ndarray) -> tuple[Decided, np.ndarray]:
-    """The rank of A + B of closed chains, and the right singular vectors at all states, (B, K, 2n, 2n)."""
+    """Return the rank of A + B of closed chains, and the right singular vectors at all states, (B, K, 2n, 2n)."""
     chains, count, states, _ = growth.shape
     condensed = condense(growth, np.zeros((chains, count, states, 0)))
     rank = decide(condensed.first + condensed.last, RANK)
@@ -287,5 +293,5 @@ def _closure_null_vectors(growth: np.ndarray) -> tuple[Decided, np.ndarray]:
 
 
 def is_equilibrium(chain: Chain) -> np.ndarray:
-    """True if nothing moves along a chain, beside its states and the guess: an equilibrium closes after any time."""
+    """True if the rates along a chain are negligible: an equilibrium satisfies the conditions with any period."""
     return np.abs(chain.rate).max(axis=(1, 2)) * chain.period <= 1e-6 * np.maximum(chain.size(), 1.0)

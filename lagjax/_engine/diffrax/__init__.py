@@ -29,7 +29,7 @@ from lagjax._engine._problem import (
     solve_in_doubles,
     too_tight,
 )
-from lagjax._engine._stop_reason import End, what_stopped
+from lagjax._engine._stop_reason import End, find_stop_flags
 from lagjax._engine.diffrax._equations import MotionEquations, equations_of
 from lagjax._engine.diffrax._integrate import Converted, Jumps, Method, WithJumps, integrate
 from lagjax._engine.diffrax._jumps import freeze
@@ -283,7 +283,7 @@ def _explain_result(solution: Solution, form: MotionEquations, start: RESULTS, t
 
     at = End(solution.t_end, solution.y_end, ts[0], ts[-1], solution.accepted, solution.rejected)
     stopped = (result == RESULTS.dt_min_reached, result == RESULTS.max_steps_reached)
-    not_finite, jumps = what_stopped(acceleration, at, *stopped)
+    not_finite, jumps = find_stop_flags(acceleration, at, *stopped)
     result = RESULTS.where(jumps, RESULTS.acceleration_discontinuous, result)
     return RESULTS.where(not_finite, RESULTS.nonfinite_state, result)
 

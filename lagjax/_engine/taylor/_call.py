@@ -36,10 +36,10 @@ def derivatives_begin_in_handler(flow: Flow, members: int) -> bool:
 
 
 def run_by_handler(flow: Flow, tolerances: Tolerances, host: Callable, shapes, ts, y0, params) -> tuple:
-    """The run of N members, `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P), N few enough for one thread.
+    """Run N members, `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P), N few enough for one thread.
 
-    `host(ts, y0, params, *begun)` completes a run that the handler leaves unfinished (`_native.Begun`); its results, of
-    these `shapes`, are those of the whole run.
+    `host(ts, y0, params, *begun)` completes a run that the handler leaves unfinished (`_native.RunResults`) and returns
+    the results of the whole run, of these `shapes`.
     """
     _register_target()
     members, states = y0.shape
@@ -49,7 +49,7 @@ def run_by_handler(flow: Flow, tolerances: Tolerances, host: Callable, shapes, t
     of_handler = [(members, ts.shape[1], states), (members, states), *[rows] * 4, (members, kernel.ending_guards), size]
     call = jax.ffi.ffi_call(_TARGET, [jax.ShapeDtypeStruct(shape, np.float64) for shape in of_handler])
     begun = call(ts, y0, params, plan=np.int64(ctypes.addressof(plan)))
-    begun = _native.Begun(*vary_alike(begun, like=(ts, y0, params)))
+    begun = _native.RunResults(*vary_alike(begun, like=(ts, y0, params)))
 
     def convert_results(ts, y0, params, path, y_end, t_end, code, steps, rejected, changes, rest):
         result = jnp.where(code == _native.EVENT, EVENT_OCCURRED, SUCCESSFUL)

@@ -26,7 +26,14 @@ from lagjax._tracing import Program
 
 LARGEST_PORTION = 2**23  # numbers of the steps that are written down at once: 64 MiB
 _ROOM_AGAIN = 2  # times the steps that were taken: those of a first try are written, too
-MOST_PARTS, TRIES = 64, 4  # of a step that is too long, at once; and how often they are divided once more
+MOST_PARTS = 64  # of a step that is too long, at once
+# How often steps are divided once more, and how many times as many there may be. A function that changes within 1e-3 of
+# a step takes 7 turns, within 1e-9 of it 20: the series says that it diverges, but not how soon.
+TRIES, MOST_DIVIDED = 24, 30
+# After this many turns a function is so narrow that a step elsewhere may have passed over it unseen, as if it came at
+# the end of the step. Tangents over steps that are cut near their ends differ then; otherwise by less than `AGREEMENT`
+# of the limit, 1 as measured.
+SURE_TURNS, AGREEMENT, _NEAR_ENDS = 4, 10.0, np.array([0.0, 0.5, 0.9, 0.99])
 MOST_PROBES = 16  # directions along which steps that go past a border without a series are measured
 
 
@@ -108,7 +115,7 @@ def _jvp_over_steps(flow: Flow, motions: Motions, dots, tolerances) -> tuple[np.
         rows, of = steps.rows, motions.take(steps.rows)
         given = of.ts, of.params, steps, dy0[rows], dparams[rows]
         path_dot[rows], y_dot[rows], excess = steps.kernel.jvp(*given, tolerances.floor)
-        return excess / tolerances.largest_excess
+        return excess / tolerances.largest_excess, (path_dot[rows], y_dot[rows])
 
     for row in _differentiate_steps(flow, motions, tolerances, advance_tangents, advance_tangents):
         path_dot[row], y_dot[row] = np.nan, np.nan
@@ -183,7 +190,7 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
         rows, of = steps.rows, motions.take(steps.rows)
         given = of.ts, of.params, steps, path_ct[rows], end_ct[rows]
         y_ct[rows], params_ct[rows], excess = steps.kernel.vjp(*given)
-        return excess / tolerances.largest_excess
+        return excess / tolerances.largest_excess, None
 
     def probe(steps: Steps):
         """The size of the last terms of a tangent's series along a random direction, in units of the limit.
@@ -194,9 +201,9 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
         of = motions.take(steps.rows)
         found = np.isfinite(np.concatenate([y_ct[steps.rows], params_ct[steps.rows]], axis=1))
         y_dot, params_dot = np.split(np.where(found[:, None], directions, 0.0), [flow.states], axis=2)
-        given = of.ts[:, [0, -1]], of.params, steps, y_dot, params_dot
-        _, end, excess = steps.kernel.jvp(*given, tolerances.floor)
-        return np.where(np.isfinite(end).all(axis=-1).any(axis=-1), excess / tolerances.largest_excess, np.nan)
+        *tangents, excess = steps.kernel.jvp(of.ts, of.params, steps, y_dot, params_dot, tolerances.floor)
+        is_finite = np.isfinite(tangents[1]).all(axis=-1).any(axis=-1)
+        return np.where(is_finite, excess / tolerances.largest_excess, np.nan), tangents
 
     if lost := list(_differentiate_steps(flow, motions, tolerances, transpose_steps, probe)):
         of = motions.take(np.array(lost))
@@ -265,17 +272,18 @@ def _differentiate_steps(
 ) -> Iterator[int]:
     """Call `go(steps)`, which differentiates over steps, for all rows; yield the rows without accurate steps.
 
-    `go` and `probe` return the size of the last terms of the series, (R,), in units of the limit. That of `go` may be
-    an upper bound; if `probe` exceeds 1, the steps are divided until they are accurate.
+    `go` and `probe` return the size of the last terms of the series, (R,), in units of the limit, and `probe` the
+    tangents as well. That of `go` may be an upper bound; if `probe` exceeds 1, the steps are divided until they are
+    accurate.
     """
     for steps in _record_steps(flow, motions, tolerances):
         limit = _last_term_limit(steps)
-        excess = go(steps)
+        excess, _ = go(steps)
         long = np.flatnonzero(excess > limit)
         if not long.size:
             continue
         steps = steps.take(long)
-        excess = excess[long] if probe is go else probe(steps)
+        excess = excess[long] if probe is go else probe(steps)[0]
 
         for k in np.flatnonzero(~(excess <= limit)).tolist():
             row = int(steps.rows[k])
@@ -313,23 +321,37 @@ def _record_steps(flow: Flow, motions: Motions, tolerances: Tolerances) -> Itera
 def _suitable_steps(flow: Flow, steps: Steps, params, tolerances, excess, measure: Callable) -> Steps | None:
     """The steps of one member, divided until they are accurate for its tangents; None if that fails.
 
-    `excess` (1,), and the result of `measure(steps)`, is the size of the last terms of the series, in units of the
-    limit; the record has it for each step. If it does not fall as the steps of a constrained motion do, it is rounding,
-    as near a dead centre: then its own steps are right.
+    `excess` (1,), and the first result of `measure(steps)`, is the size of the last terms of the series, in units of
+    the limit; the record has it for each step. If it does not fall as the steps of a constrained motion do, it is
+    rounding, as near a dead centre: then its own steps are right.
     """
     divided, found = steps, []
-    for _ in range(TRIES):
-        if math.isnan(before := float(excess[0])):
-            return None
+    for turn in range(TRIES):
+        before = float(excess[0])
+        if math.isnan(before) or len(divided.table) > MOST_DIVIDED * (len(steps.table) + MOST_PARTS):
+            break
         divided = _divide_steps(flow, divided, params, tolerances)
-        found.append((float((excess := measure(divided))[0]), len(found), divided))
+        excess, tangents = measure(divided)
+        found.append((float(excess[0]), turn, divided))
         if excess <= _last_term_limit(steps):
-            return divided
+            if turn < SURE_TURNS:
+                return divided
+            cut = cut_steps(flow, divided, [_NEAR_ENDS] * len(divided.table), params, tolerances)
+            return cut if _tangents_agree(tangents, measure(cut)[1], tolerances) else None
         if flow.projection is not None and float(excess[0]) > 0.5 * before:
             measure(steps)
             return steps
     least, _, best = min(found, default=(math.inf, 0, None))
     return best if least <= 1.0 else None
+
+
+def _tangents_agree(first, second, tolerances: Tolerances) -> bool:
+    """True if tangents of outputs and ends over two sequences of steps are the same to the accuracy of these."""
+    for a, b in zip(first, second, strict=True):
+        size, difference = (np.nanmax(np.abs(x), initial=0.0) for x in (a, a - b))
+        if not difference <= AGREEMENT * tolerances.largest_excess * size:
+            return False
+    return True
 
 
 def _divide_steps(flow: Flow, steps: Steps, params, tolerances: Tolerances) -> Steps:

@@ -12,7 +12,7 @@ import numpy as np
 
 from lagjax import _native
 from lagjax._engine._problem import Solution
-from lagjax._engine._stop_reason import End, what_stopped
+from lagjax._engine._stop_reason import End, find_stop_flags
 from lagjax._engine.taylor._variational import tangent_programs
 from lagjax._equations import forms
 from lagjax._interface import RESULTS, SUCCESSFUL, code_of
@@ -60,7 +60,7 @@ class Tolerances(NamedTuple):
 
     @property
     def floor(self) -> float:
-        return _native.floor_of(self.rtol, self.atol)
+        return _native.small_size(self.rtol, self.atol)
 
     @property
     def with_larger_budget(self) -> "Tolerances":
@@ -173,7 +173,7 @@ class Flow:
 
     # ---- forward ----
 
-    def run(self, ts, y0, params, tolerances: Tolerances, begun: _native.Begun | None = None) -> Solution:
+    def run(self, ts, y0, params, tolerances: Tolerances, begun: _native.RunResults | None = None) -> Solution:
         """Integrate N members: `ts` (N, T) or (1, T), `y0` (N, 2n), `params` (N, P) or (1, P) → a `Solution`.
 
         Result codes tell what stopped a member, beyond steps that became too small or too many. A run that a handler
@@ -195,7 +195,7 @@ class Flow:
         solution = Solution(*done[:3], result, done.steps, done.rejected, done.changes, done.idle)
         if done.table is not None and done.complete is not None:
             rows = np.flatnonzero(done.complete)
-            counts, order = done.steps[rows], order or _native.order_for(rtol)
+            counts, order = done.steps[rows], order or _native.choose_order(rtol)
             found.append(Steps(done.table, np.cumsum(counts) - counts, counts, order, self.kernel, rows))
         if not (result == SUCCESSFUL).all():
             again, flow, tolerances = self._members_to_repeat(solution, ts, params, tolerances)
@@ -219,7 +219,7 @@ class Flow:
         acceleration = functools.partial(self._accelerations, numbers)
         y_end, t_end, _, accepted, rejected = (x[some] for x in solution[1:6])
         end = End(t_end, y_end, times[:, 0], times[:, -1], accepted, rejected)
-        not_finite, jumps = what_stopped(acceleration, end, shrank[some], spent[some])
+        not_finite, jumps = find_stop_flags(acceleration, end, shrank[some], spent[some])
         solution.result[some[jumps]] = _JUMPS
         solution.result[some[not_finite]] = _NOT_FINITE
         return solution

@@ -46,16 +46,8 @@ from lagjax._engine.taylor._passages import has_passages
 from lagjax._engine.taylor._state_rates import rate
 from lagjax._engine.taylor._variational import from_rows, to_rows
 from lagjax._interface import SUCCESSFUL, default_platform
-from lagjax._native import Begun, Projection
-from lagjax._primitives import (
-    NOT_EXPORTED,
-    LinearMap,
-    call_host,
-    compute_on_host,
-    cond_alike,
-    cotangent_of,
-    is_zero,
-)
+from lagjax._native import Projection, RunResults
+from lagjax._primitives import NOT_EXPORTED, LinearMap, call_host, compute_on_host, cond_alike, cotangent_of, is_zero
 from lagjax._program import Unlowerable
 from lagjax._tracing import Program
 
@@ -396,7 +388,7 @@ def _run_compiled(ts, y0, params, *, flow, tolerances):
 
         def finish_run(ts, y0, params, *begun):
             """The outputs of a run that Python completes from `begun`."""
-            return flow.run(ts, y0, params, tolerances, Begun(*begun))[:_OUTPUTS]
+            return flow.run(ts, y0, params, tolerances, RunResults(*begun))[:_OUTPUTS]
 
         return _restore_batch(run_by_handler(flow, tolerances, finish_run, of_rows, *rows), batch)
 

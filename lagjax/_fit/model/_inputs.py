@@ -16,7 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._run.hybrid import Hybrid, Scene, Transition, laws
-from lagjax._scene import MARGINS, Driven, System, asking_for_inputs, continued, drive_function, drive_scene, samples
+from lagjax._scene import (
+    MARGINS,
+    DrivenParams,
+    System,
+    append_samples,
+    drive_function,
+    drive_scene,
+    roles_with_inputs,
+    samples,
+)
 
 PyTree = Any
 _LEAST_ROOM, _GROWTH = 16, 4  # of tables: at most four times what is needed, and six programs up to 16 000 samples
@@ -68,11 +77,11 @@ class InputForm(NamedTuple):
         if not input_functions(system):
             return system, params
         table = build_table([(ts, inputs)], self.hold)
-        return self.drive_scene(system), Driven(params, SampleTable(table.knots[0], table.values[0]))
+        return self.drive_scene(system), DrivenParams(params, SampleTable(table.knots[0], table.values[0]))
 
-    def params(self, params: PyTree, room: int) -> Driven:
+    def params(self, params: PyTree, room: int) -> DrivenParams:
         """Parameters of the driven scene, with a table of zeros of this many instants: a structure."""
-        return Driven(params, SampleTable(np.arange(float(room)), np.zeros((room, self.size))))
+        return DrivenParams(params, SampleTable(np.arange(float(room)), np.zeros((room, self.size))))
 
 
 @functools.lru_cache(maxsize=16)
@@ -94,7 +103,7 @@ def split_leaves(flat, tree, shapes: tuple[tuple[int, ...], ...]) -> PyTree:
 
 
 def input_functions(scene: Scene) -> list[str]:
-    return [role for law in laws(scene) for role in asking_for_inputs(law)]
+    return [role for law in laws(scene) for role in roles_with_inputs(law)]
 
 
 def table_length(count: int) -> int:
@@ -112,7 +121,7 @@ def build_table(pieces: list[tuple[np.ndarray, np.ndarray]], hold: str) -> Sampl
         count = len(ts)
         spacing = (ts[-1] - ts[0]) / (count - 1) if count > 1 else max(1.0, abs(ts[0]))
         knots[row] = np.concatenate([ts, ts[-1] + spacing * np.arange(1, room - count + 1)])
-        values[row, :count], values[row, count:] = inputs, continued(inputs, room - count, hold)
+        values[row, :count], values[row, count:] = inputs, append_samples(inputs, room - count, hold)
     return SampleTable(knots, values)
 
 

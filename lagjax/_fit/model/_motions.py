@@ -33,7 +33,7 @@ from lagjax._native import Projection
 from lagjax._primitives import sentence
 from lagjax._run import simulate
 from lagjax._run.hybrid import Scene, first_law, jumps
-from lagjax._scene import Driven, System
+from lagjax._scene import DrivenParams, System
 
 PyTree = Any
 
@@ -163,7 +163,7 @@ def _programs_once(scene: Scene, layout: Layout, tree, leaves: tuple, options: t
 
     def scene_params(numbers, table):
         params = restore(numbers)
-        return Driven(params, table) if is_driven else params
+        return DrivenParams(params, table) if is_driven else params
 
     def run(state, ts, table):
         y0, numbers = state
@@ -231,7 +231,7 @@ class Manifold:
         def project(y: jax.Array, t, numbers, table) -> jax.Array:
             q, qdot = map(layout.restore, halves(y))
             params = parameters.restore(numbers)
-            q, qdot = scene.project(q, qdot, t, params if form is None else Driven(params, table))
+            q, qdot = scene.project(q, qdot, t, params if form is None else DrivenParams(params, table))
             return jnp.concatenate([layout.flatten(q), layout.flatten(qdot)])
 
         def project_with_derivatives(*arguments):

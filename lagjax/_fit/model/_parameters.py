@@ -148,8 +148,11 @@ class Parameters:
     @functools.cached_property
     def unknowns(self) -> "Unknowns":
         """The unknowns that the numbers of each record depend on."""
+        shared = np.flatnonzero(self._owner_of < 0)
+        if len(shared) == len(self):
+            return Unknowns(np.tile(shared, (len(self.owners), 1)), self.owners, 0, len(self))
         own = [np.flatnonzero(self._owner_of == owner) for owner in self.owners]
-        room, shared = max(map(len, own), default=0), np.flatnonzero(self._owner_of < 0)
+        room = max(map(len, own), default=0)
         filled = [np.append(some, np.full(room - len(some), len(self))) for some in own]
         rows = [np.append(some, shared) for some in filled]
         return Unknowns(np.array(rows, int).reshape(len(own), -1), self.owners, room, len(self))

@@ -39,7 +39,7 @@ from lagjax._fit.model._timings import Clock
 from lagjax._interface import Layout, halves
 from lagjax._run import simulate
 from lagjax._run.hybrid import Scene
-from lagjax._scene import Driven
+from lagjax._scene import DrivenParams
 
 
 class Point(NamedTuple):
@@ -320,7 +320,7 @@ class SystemResiduals:
         def sense(ts, y0, numbers, inputs, table):
             q, qdot = map(layout.restore, halves(y0))
             params = self.restore(numbers)
-            own = params if form is None else Driven(params, table)
+            own = params if form is None else DrivenParams(params, table)
             motion = simulate(scene, q, qdot, ts, own, rtol=self.rtol, throw=False)
             rows = jax.vmap(lambda q, v: jnp.concatenate([layout.flatten(q), layout.flatten(v)]))(motion.q, motion.qdot)
             return jax.vmap(lambda y, t, i: signals.evaluate_state(y, t, numbers, i))(rows, ts, inputs)

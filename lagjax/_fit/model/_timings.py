@@ -219,6 +219,12 @@ def build_clock(scene: Scene, layout: Layout, parameters: Parameters, timings: T
         return jnp.where(mine.any(axis=1), jnp.where(mine, t, 0.0).sum(axis=1), jnp.nan)
 
     def describe_failure(y0, numbers) -> str:
+        try:
+            return count_instants(y0, numbers)
+        except ValueError as reason:  # of a number that the scene refuses, such as a restitution beyond 1
+            return str(reason)
+
+    def count_instants(y0, numbers) -> str:
         first = int(np.argmax(~np.isfinite(np.asarray(times(y0, numbers)))))
         motion = simulate(scene, *given(y0, numbers), rtol=rtol, throw=False)
         t_end, happened = float(motion.end.t), int(instants(*given(y0, numbers))[0][first].sum())

@@ -26,7 +26,7 @@ Biometrika 69 (1982) 19, for λ; Kass & Raftery, J. Am. Stat. Assoc. 90 (1995) 7
 import contextlib
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -36,7 +36,7 @@ from lagjax._equations import decide
 from lagjax._fit.model._law_parameters import FoundLaw
 from lagjax._fit.model._noise import AbstractNoise
 from lagjax._fit.model._parameters import Parameters
-from lagjax._fit.model._residuals import LostMotion, Point, qr_triangle
+from lagjax._fit.model._residuals import LostMotion, Point, Residuals, qr_triangle
 from lagjax._fit.result._comparison import choose_simplest, cross_validate
 from lagjax._fit.result._information import Information, information, parameter_rows
 from lagjax._fit.search._descent import Descent, column_norms, eliminate, minimise
@@ -71,11 +71,13 @@ class Selection(NamedTuple):
 
     - `kept`: the names of the terms that are kept; `steps`: the fits that were compared, from all terms to few.
     - `alike`: sentences for the terms that the data cannot tell apart.
+    - `idle`: the free numbers that only terms which are not kept depend on; they stay at their guess.
     """
 
     kept: tuple[str, ...]
     steps: tuple[SelectionStep, ...]
     alike: tuple[str, ...]
+    idle: tuple[str, ...]
     text: str
 
     def __repr__(self) -> str:
@@ -96,13 +98,15 @@ def select_terms(
     alike = list(dict.fromkeys(alike))
     kept, count = tuple(best.columns), len(search.names)
     said = f"Of {count} terms {len(kept)} {'is' if len(kept) == 1 else 'are'} kept, {why}: {', '.join(kept) or 'none'}."
-    end = minimise(best.done.residuals, best.done.trial.point, law, _ENOUGH, _TRIALS)
+    residuals, point, idle = best.hold_idle(search.path[0])
+    end = minimise(residuals, point, law, _ENOUGH, _TRIALS)
     if len(done.residuals.pieces) > len(done.residuals.records):
         end = end._replace(message=done.message, converged=done.converged and end.converged)
     end = end._replace(trials=done.trials + search.trials, message=" ".join([end.message, said, *alike]))
     unused = [f"Nothing that was measured depends on {name!r}." for name, same in search.same.items() if not same]
+    unused += [f"Only terms that are not kept depend on {label}, which stays at its guess." for label in idle]
     text = "\n".join([*search.rows(), said, *alike, *unused])
-    return end, Selection(kept, tuple(search.steps), tuple(alike), text)
+    return end, Selection(kept, tuple(search.steps), tuple(alike), tuple(idle), text)
 
 
 def keep_selected(parameters: Parameters, selection: Selection, laws: list[FoundLaw]) -> Parameters:
@@ -110,7 +114,14 @@ def keep_selected(parameters: Parameters, selection: Selection, laws: list[Found
     columns = _term_columns(_label_terms(laws), parameters)
     lost = [own for name, own in columns.items() if name not in selection.kept]
     stays = np.isin(np.arange(len(parameters)), np.concatenate([np.zeros(0, int), *lost]))
-    return parameters.zero(parameters.inverse(parameters.first), stays)
+    fewer = parameters.zero(parameters.inverse(parameters.first), stays)
+    return fewer.fix(fewer.inverse(fewer.first), _mark_unknowns(fewer, selection.idle))
+
+
+def _mark_unknowns(parameters: Parameters, labels: Collection[str]) -> np.ndarray:
+    """True for each unknown (F,) of the numbers with these labels."""
+    marks = [np.full(own.stop - own.start, part.label in labels) for own, _, part in parameters.cuts]
+    return np.concatenate([np.zeros(0, bool), *marks])
 
 
 def _alike_sentence(others, kept) -> str:
@@ -233,6 +244,24 @@ class _TermFit(NamedTuple):
             alive.remove(same[-1])
             found[same[-1]] = same[:-1]
         return found
+
+    def hold_idle(self, whole: "_TermFit") -> tuple[Residuals, Point, list[str]]:
+        """The residuals and the point of this fit where the numbers that nothing depends on, but did in the fit with
+        the `whole` law, stay at their guess; and the labels of these."""
+        unread = []
+        for fit in (self, whole):
+            residuals = fit.done.residuals
+            triangles = residuals.linearise(fit.done.trial, fit.done.noise)
+            rows = parameter_rows(triangles, residuals.states, residuals.unknowns)
+            unread.append({part.label for own, _, part in residuals.parameters.cuts if not rows[:, own].any()})
+        residuals, trial, first = self.done.residuals, self.done.trial, whole.done.residuals.parameters
+        labels = sorted(unread[0] - unread[1])
+        if not labels:
+            return residuals, trial.point, labels
+        stays, u = _mark_unknowns(residuals.parameters, labels), trial.u.copy()
+        u[stays] = first.inverse(first.first)[_mark_unknowns(first, labels)]
+        residuals = residuals.with_parameters(residuals.parameters.fix(u, stays))
+        return residuals, Point(u[~stays], trial.starts), labels
 
     def drop(self, names, law: AbstractNoise) -> Descent | None:
         """The fit without some terms, from where the linear model puts the others; None where none can be followed."""

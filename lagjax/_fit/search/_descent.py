@@ -34,6 +34,7 @@ from lagjax._fit.model._residuals import LostMotion, Point, Residuals, Trial, co
 _FIRST, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-14, 1e12
 _PATIENCE = 12  # trials that lowered the sum of squares by less than ends a search, while derivatives promised more
 _NEAR = 1e-3  # per sample: where it pays to look at how much the residuals are correlated
+_TAKEN_BACK = 8  # trials of a search: of that many in turn the last step is 2⁻³⁶ as long as the first
 _FLAT = 1e-13  # relative: half the sum of squares is itself rounded to so much
 _STOPPED = "The search was stopped after {} trials: half the sum of squares may fall by {:.2g}."
 _KINK = (
@@ -138,7 +139,24 @@ def minimise(
     trial = residuals.evaluate(point)
     anchor = Anchor(point.u, np.zeros_like(point.u)) if anchor is None else anchor
     anchor = anchor.add_prior(residuals.parameters.prior_weights)
-    damping, trials, falls = _FIRST, 1, [(1, np.inf)]
+    done, blind = _descend(residuals, trial, law, enough, limit, anchor, 1, _TAKEN_BACK)
+    if blind is None or residuals.log_likelihood(blind, residuals.noise_scale(blind, law)) <= (
+        residuals.log_likelihood(done.trial, done.noise)
+    ):
+        return done
+    return _descend(residuals, blind, law, enough, limit, anchor, done.trials, 0)[0]
+
+
+def _descend(
+    residuals: Residuals, trial: Trial, law: AbstractNoise, enough: float, limit: int, anchor: Anchor, trials: int,
+    takes_back: int,
+) -> tuple[Descent, Trial | None]:  # fmt: skip
+    """The end of the search from a trial, which `takes_back` this number of trials at most, and the last one of them.
+
+    Those are better trials at which nothing depends any more on an unknown that mattered before: a contact that sticks
+    says nothing of its friction, and no step leads out of there. Shorter steps are tried instead.
+    """
+    damping, falls, blind, limit = _FIRST, [(trials, np.inf)], None, trials + limit - 1
     while True:
         model = _Model(residuals, trial, law, anchor)
         gain = model.step(_LEAST_DAMPING).gain
@@ -149,24 +167,30 @@ def minimise(
                 trial, trials = farther, trials + 1
                 continue
             if model.is_enough(gain, enough):
-                return end(True, trials, f"The search converged after {trials} trials.")
-            return end(False, trials, _STOPPED.format(trials, gain))
+                return end(True, trials, f"The search converged after {trials} trials."), blind
+            return end(False, trials, _STOPPED.format(trials, gain)), blind
         recent = sum(fall for place, fall in falls if place > trials - _PATIENCE)
-        if trials > _PATIENCE and model.is_enough(recent, enough):
-            return end(False, trials, _KINK.format(trials, gain, _PATIENCE, recent))
-        better, damping, trials = _find_better_trial(model, damping, trials, limit)
+        if trials - falls[0][0] >= _PATIENCE and model.is_enough(recent, enough):
+            return end(False, trials, _KINK.format(trials, gain, _PATIENCE, recent)), blind
+        better, damping, trials, taken_back = _find_better_trial(model, damping, trials, limit, takes_back)
+        takes_back -= len(taken_back)
+        blind = taken_back[-1] if taken_back else blind
         if better is None and trials < limit:
-            return end(True, trials, f"The search stopped where rounding hides what is left, after {trials} trials.")
+            text = f"The search stopped where rounding hides what is left, after {trials} trials."
+            return end(True, trials, text), blind
         if better is None:
-            return end(False, trials, _STOPPED.format(trials, gain))
+            return end(False, trials, _STOPPED.format(trials, gain)), blind
         falls.append((trials, model.cost - model.cost_of(better)))
         trial = better
 
 
-def _find_better_trial(model: _Model, damping: float, trials: int, limit: int) -> tuple[Trial | None, float, int]:
-    """The first better trial, the next damping and the count of trials; None instead of a trial after `limit` of them,
-    or where steps promise no more than the rounding of sums of squares."""
-    growth, at, residuals = 2.0, model.trial, model.residuals
+def _find_better_trial(
+    model: _Model, damping: float, trials: int, limit: int, takes_back: int
+) -> tuple[Trial | None, float, int, list[Trial]]:
+    """The first better trial, the next damping, the count of trials, and those that were taken back; None instead of a
+    trial after `limit` of them, or where steps promise no more than the rounding of sums of squares."""
+    growth, at, residuals, blind = 2.0, model.trial, model.residuals, []
+    seen = _find_seen(residuals, at)
     while trials < limit:
         step = model.step(damping)
         if step.gain <= _FLAT * model.cost or damping > _MOST_DAMPING:
@@ -175,10 +199,21 @@ def _find_better_trial(model: _Model, damping: float, trials: int, limit: int) -
         with contextlib.suppress(LostMotion):
             trial = residuals.evaluate(Point(residuals.parameters.take_step(at.u, step.u), at.starts + step.starts))
             fall = model.cost - model.cost_of(trial)
-            if fall > 0.0:
-                return trial, max(_LEAST_DAMPING, damping * max(0.1, 1.0 - (2.0 * fall / step.gain - 1.0) ** 3)), trials
+            if fall > 0.0 and len(blind) < takes_back and (seen & ~_find_seen(residuals, trial)).any():
+                blind.append(trial)
+            elif fall > 0.0:
+                damping = max(_LEAST_DAMPING, damping * max(0.1, 1.0 - (2.0 * fall / step.gain - 1.0) ** 3))
+                return trial, damping, trials, blind
         damping, growth = damping * growth, 2.0 * growth
-    return None, damping, trials
+    return None, damping, trials, blind
+
+
+def _find_seen(residuals: Residuals, trial: Trial) -> np.ndarray:
+    """The unknowns (F,), as a mask, on which anything that was measured depends at a trial."""
+    each = np.zeros((len(residuals.pieces), residuals.unknowns.columns.shape[1]))
+    for batch, slopes in zip(residuals.batches, trial.slopes, strict=True):
+        each[batch.rows] = slopes[..., residuals.states :].any(axis=(1, 2))
+    return residuals.unknowns.norms(each) > 0
 
 
 def eliminate(

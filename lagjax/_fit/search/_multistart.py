@@ -62,10 +62,20 @@ def _search_shortly(residuals: Residuals, u: np.ndarray, starts: np.ndarray) -> 
     return misfit(done.noise, residuals), done.trial.point
 
 
+def _describe_misfit(misfit: float) -> str:
+    return f"{misfit:.3g} of the signals" if np.isfinite(misfit) else "its motion could not be followed"
+
+
 def run_multistart(
-    residuals: Residuals, search: Callable[[Point], Descent], point: Point, starts: int, seed: int
+    residuals: Residuals,
+    search: Callable[[Point], Descent],
+    point: Point,
+    starts: int,
+    seed: int | list[int],
+    tell: Callable[[str], None] | None = None,
 ) -> tuple[Descent, Waterfall | None]:
-    """The best of the searches from a point and from `starts` − 1 random values of u, and what all of them came to."""
+    """The best of the searches from a point and from `starts` − 1 random values of u, and what all of them came to;
+    `tell` prints a line for each."""
     if starts == 1:
         return search(point), None
     rng = np.random.default_rng(seed)
@@ -73,7 +83,12 @@ def run_multistart(
     pieces = [Piece(k, places[even_places(len(places), _SHORT_SAMPLES)]) for k, places in residuals.pieces]
     short = residuals.with_pieces(pieces, residuals.fitted)
     short.watch = None
-    trials = sorted((_search_shortly(short, one, point.starts) for one in u), key=lambda trial: trial[0])
+    trials = []
+    for k, one in enumerate(u):
+        trials.append(_search_shortly(short, one, point.starts))
+        if tell:
+            tell(f"start {k + 1} of {starts}: {_describe_misfit(trials[-1][0])} after a short search")
+    trials.sort(key=lambda trial: trial[0])
     misfits, done, chosen = np.array([trial[0] for trial in trials]), [], []
     for k in np.flatnonzero(np.isfinite(misfits)).tolist():  # the best of different misfits
         if all(abs(np.log(misfits[k] / misfits[j])) > 1e-3 for j in chosen):

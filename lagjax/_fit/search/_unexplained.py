@@ -50,9 +50,9 @@ def measure_unexplained(done: Descent) -> Unexplained:
         with np.errstate(divide="ignore"):
             order = np.argsort(-parts.motion[large] / parts.own[large], kind="stable")
         left += [
-            f"The fit leaves {_percent(np.sqrt(parts.left[k]), np.sqrt(parts.own[k]))} of {name} in "
-            f"{residuals.label(parts.records[k])}, and less in others: is it a record of this scene, with the signs of "
-            "the others?"
+            f"The fit leaves {_percent(parts.left[k].item() ** 0.5, parts.own[k].item() ** 0.5)} of {name} in "
+            f"{residuals.label(int(parts.records[k]))}, and less in others: is it a record of this scene, with the "
+            "signs of the others?"
             for k in (large[order][:MOST_NAMED] if len(large) < len(parts.records) else ())
         ]
     return Unexplained(left, noisy, float(max(shares)), doubted, np.argsort(-of_records, kind="stable").tolist())

@@ -1,19 +1,18 @@
-"""The values that a function reads: its code, and the values that it takes from outside, however far away they are.
+"""The values that a user's function reads: its code, and all values from outside of it, directly or through helpers.
 
-    Walk      goes through a function and all that it uses: globals, closures, attributes, helpers, classes, arrays
-    identity  that as a text, the same in every process: a store of a sweep tells by it whether `keep` has changed
-    Edition   a function as it is now, with what it reads: what is derived from it serves while that is the same
+    Walk      visits a function and all that it uses: globals, closures, attributes, helpers, classes, arrays
+    identity  the result as text, the same in every process: a stored sweep detects by it that `keep` has changed
+    Edition   a function with all that it read at one time: results derived from it are valid until that changes
 
 **What is seen.** Numbers, texts, arrays, containers, functions, classes and objects that the code names: globals, also
 of helpers in the user's other modules, closure cells, defaults, keywords of `functools.partial`, attributes of objects
 and functions, modules imported inside. Installed packages are named, not read.
 
 **What is not seen.** Files and environment variables that a function reads while it runs, `globals()["c"]` and other
-names that it makes up, the inside of objects written in C (a generator, a random generator, a lock), and what
-`functools.cache` or another memory of the user's own keeps.
+computed names, the inside of objects written in C (a generator, a random generator, a lock), and what `functools.cache`
+or another cache of the user's own keeps.
 
-`Walk` and `identity` stand in `_identity`, which reads byte code for them, `Edition` in `_edition`; `_marks` makes the
-next look quick.
+`Walk` and `identity` are in `_identity`, which reads byte code, `Edition` in `_edition`; `_marks` makes checks fast.
 """
 
 from lagjax._interface.reads._edition import Edition

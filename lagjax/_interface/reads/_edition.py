@@ -1,11 +1,11 @@
-"""`Edition`: a user's function as it is now, with what it reads.
+"""`Edition`: a user's function with all values that it read at one time; the key of caches of compiled results.
 
-What is derived from a function is kept under its edition. On the next call `Edition.now` looks whether all that was
-read is still there; if not, the walk is gone again, and another text is another edition, under which everything is
-derived anew. Two functions of one text, as a lambda in a loop gives them, are one edition.
+On the next call `Edition.now` checks whether all of these values are unchanged. If not, the function is walked again,
+and a different text makes a new edition, for which everything is derived anew. Two functions with the same text, such
+as a lambda in a loop, are the same edition.
 
-JAX keeps the traces of helpers that a function hands to it, as the branches of `jax.lax.cond` or what is under
-`jax.jit`, and finds them by the helper alone. A trace under another context is another one: see `Edition.traced`.
+JAX caches the traces of helpers that a function passes to it, such as the branches of `jax.lax.cond` or functions under
+`jax.jit`, by the helper alone. A trace under another context is another entry: see `Edition.traced`.
 """
 
 import collections
@@ -32,7 +32,7 @@ _inside = threading.local()  # whether a function of the user is being traced
 
 
 class Edition:
-    """A user's function together with all that it read when this edition was made; equal where both are the same."""
+    """A user's function with all that it read when this edition was made; equal if both are the same."""
 
     __slots__ = ("__weakref__", "_hash", "_held", "_watch", "function", "helped", "text", "tracers")
 
@@ -48,15 +48,15 @@ class Edition:
         return (_watch_of(function) if is_plain else _Watch(function)).edition()
 
     def trace_edition(self, function: Callable, how: str) -> "Edition":
-        """The edition of a trace of this one whose tracers are arguments, by `how`: one, whatever is being traced."""
+        """Return the edition of a jaxpr of this function whose tracers became arguments; `how` is part of its key."""
         return Edition(function, f"{how}: {self.text}", self._held)
 
     def now(self) -> "Edition":
-        """The present edition of the same function: this one, where nothing that it reads has changed."""
+        """Return the current edition of the function: `self` if nothing that it reads has changed."""
         return self if self._watch is None else self._watch.edition()
 
     def require_present(self) -> None:
-        """Raise `ValueError` where this is not the present edition."""
+        """Raise `ValueError` if a value that the function reads has changed since this edition."""
         now = self.now()
         if now is not self and now != self:
             raise ValueError(
@@ -81,7 +81,7 @@ class Edition:
         return repr(self.function)
 
     def __reduce__(self):
-        """The function by name; one that has none, such as a lambda, by value, as cloudpickle packs it."""
+        """Pickle the function by name; without an importable name, as a lambda, by value with cloudpickle."""
         try:
             pickle.dumps(self.function)
             return _pickled_edition, (self.function,)
@@ -97,7 +97,7 @@ class Edition:
 
     @contextlib.contextmanager
     def traced(self) -> Iterator[None]:
-        """While the function runs. Raises `ValueError` where it is another edition by now."""
+        """Context in which the function is called; raises `ValueError` if this is not its current edition."""
         # What the function itself changes while it runs (it counts its calls, it remembers results) is found out here,
         # and is not watched any more.
         if getattr(_inside, "is_traced", False):  # what it calls is part of what was read
@@ -115,7 +115,7 @@ class Edition:
 
 
 def _pickled_edition(function: Callable) -> Edition:
-    """The function that a pickle calls: cloudpickle would take the class with all that it reads for a method of it."""
+    """Rebuild an edition from a pickle; a function, as cloudpickle would pack a class method with all that it reads."""
     return Edition.from_function(function)
 
 
@@ -130,7 +130,7 @@ _MOST_OWN = 1000
 
 
 class _Watch:
-    """A function, its latest edition, and where all that it read was found."""
+    """A function, its latest edition, and the places where all values that it read were found."""
 
     def __init__(self, function: Callable):
         self.function = function
@@ -159,7 +159,7 @@ class _Watch:
             wanted = names
 
     def settle(self) -> None:
-        """Look what has changed while the function ran: what it writes to is not watched from now on."""
+        """After a call: stop watching places that the function itself has written to."""
         latest = self._latest
         if latest is None or latest[0].hold():
             return
@@ -171,7 +171,7 @@ class _Watch:
 
 
 def _changed_places(before: Marks, now: "_LiveWalk") -> dict[tuple[int, str | None], Any]:
-    """The place that has another value now than before."""
+    """Return the places, by id and key, whose value differs between `before` and `now`."""
     keys = before.keys
     new = {key: place for key, place in now.marks.keys.items() if key not in keys}
     return new | {(id(place), key): place for place, key in before.changed() if key is not SIZE}
@@ -182,7 +182,7 @@ _watch_of = functools.lru_cache(maxsize=64)(_Watch)
 
 
 class _LiveWalk(Walk):
-    """A walk in this process: it marks where everything is, and skips attributes that no code names."""
+    """A walk in this process: it records where every value is (`Marks`), and skips attributes that no code names."""
 
     # A mapping of another class is an object: what it gives may be made anew each time.
     containers = (dict, types.MappingProxyType, list, tuple, set, frozenset, collections.deque)
@@ -193,7 +193,7 @@ class _LiveWalk(Walk):
         self.marks, self.tracers = Marks(), []
 
     def is_own(self, place: Any, key: str | None) -> bool:
-        """True if code that was met may have changed what is there."""
+        """True if code that was visited may itself have changed the value at this place."""
         if key is None or self.wanted is None:
             return place is not None
         return key in self.code.stored or id(place) in self.of_libraries

@@ -1,8 +1,8 @@
-"""A function or a value in words: its code, and all that it uses from outside, however far away that is.
+"""`Walk`: a function or a value as text, with its code and all values that it uses, directly or through helpers.
 
-Two values with one text compute the same; so a store can tell whether `keep` is still the function it was begun with.
-The text of a value that went to another process by cloudpickle is the same there: no address, no order of a set, and
-nothing of what libraries keep for themselves enters. What is of an installed package is named, not read.
+Two values with the same text compute the same, so a stored sweep can detect that `keep` has changed. The text is the
+same in another process, after cloudpickle: it contains no addresses, no order of sets, and no internal state of
+libraries. Of installed packages it has only the names.
 """
 
 import array
@@ -37,13 +37,15 @@ CHANGING = "what the function itself changes"  # in the place of such a value
 
 
 def identity(value: Any) -> str:
-    """The text of a function or a value: a line for each function, class and object that is met."""
+    """Return the text of a function or a value: a line for each function, class and object that is visited."""
     return Walk().text(value)
 
 
 class Walk:
-    """Functions, classes and objects in the order in which they are met, each described once; of attributes those in
-    `wanted`, None for all. A subclass may look on (`read`), and keep what is too large or has no text in `held`."""
+    """Visits functions, classes and objects, and describes each once; of attributes those in `wanted`, None for all.
+
+    A subclass may intercept `read`; things that are too large or have no text are compared by identity, in `held`.
+    """
 
     containers: tuple[type, ...] = (Mapping, list, tuple, set, frozenset, collections.deque)
     most_things = largest_container = math.inf
@@ -56,7 +58,7 @@ class Walk:
         self._numbers: dict[int, int] = {}
 
     def read(self, place: Any, key: Any, value: Any) -> Any:
-        """A value that is found in a dict or an object by a key, or in a cell; or `CHANGING` in its place."""
+        """Return the value found at `key` of a dict or object, or in a cell; or `CHANGING` to leave it out."""
         # With the key None it is the place itself.
         return value
 
@@ -64,7 +66,7 @@ class Walk:
         return array_text(value)
 
     def wants(self, name: str, value: Any, owner: Any) -> bool:
-        """True if an attribute of an object, a class or a function of the user is one of the things it reads."""
+        """True if an attribute of a user's object, class or function may be read by the code that was visited."""
         if isinstance(value, functools.cached_property):
             self.code.stored.add(name)
         if self.wanted is None or name in self.wanted or isinstance(owner, enum.EnumType):
@@ -74,20 +76,20 @@ class Walk:
         return isinstance(owner, type) and name.startswith("__")
 
     def hold(self, thing: Any) -> str:
-        """The name of a thing that is known by its identity."""
+        """Add a thing to `held`, to be compared by identity, and return its name."""
         return f"{type(thing).__qualname__} {place_in(self.held, thing)}"
 
     # ---- the walk ----
 
     def text(self, value: Any) -> str:
-        """A value in words, and under it a line for everything that has a number there."""
+        """Return the description of a value, followed by a line for every numbered thing in it."""
         lines = [self.name(value)]
         for k, thing in enumerate(self.things):  # which grows meanwhile
             lines.append(f"#{k} {self.line(thing)}")
         return "\n".join(lines)
 
     def name(self, value: Any, deep: int = 0) -> str:
-        """A value in words; of functions, classes and objects a number, by which their line is found."""
+        """Return a short text for a value; for functions, classes and objects a number that refers to their line."""
         kind = type(value)
         if kind in _ATOMS:
             return shorten(repr(value))
@@ -114,7 +116,7 @@ class Walk:
         return f"#{self._numbers[id(value)]}"
 
     def container(self, value: Any, deep: int) -> str:
-        """A container with all that is in it, which may be containers: `deep` of them are around it."""
+        """Return the text of a container with all its entries; `deep` is the depth of nesting."""
         if (value := self.read(value, None, value)) is CHANGING:
             return CHANGING
         if len(value) > self.largest_container:
@@ -146,7 +148,7 @@ class Walk:
         return "\n".join([kind, *(f"    {name} = {self.name(value)}" for name, value in parts)])
 
     def _function_parts(self, function: types.FunctionType) -> Iterator[tuple[str, Any]]:
-        """The byte code, the defaults and the outer values of a function; of a library's function its closure alone."""
+        """Yield the byte code, defaults and closure of a function; of a library's function only the closure."""
         cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
         inside = {name: self.read(cell, name, cell.cell_contents) for name, cell in cells if _is_cell_filled(cell)}
         if not _is_users(function.__module__):
@@ -174,7 +176,7 @@ class Walk:
         ]
 
     def _add_module_attributes(self, used: dict[str, Any], names: set[str]) -> dict[str, Any]:
-        """The values `used` by name, and the attributes `names` of the user's modules among them, as of `helpers.f`."""
+        """Add to the values `used` the attributes `names` of the user's modules among them, as of `helpers.f`."""
         found, waiting, modules = dict(used), list(used.items()), set()
         for path, value in waiting:  # which grows meanwhile
             if isinstance(value, types.ModuleType) and _is_users(value.__name__) and value.__name__ not in modules:
@@ -186,7 +188,7 @@ class Walk:
         return found
 
     def _class_parts(self, kind: type) -> Iterator[tuple[str, Any]]:
-        """All that a class of the user holds, and the classes that it extends."""
+        """Yield the bases and the attributes of a user's class."""
         yield "bases", [*kind.__bases__, *([] if type(kind) is type else [type(kind)])]
         held = kind.__dict__
         for name, value in sorted(held.items()):
@@ -197,7 +199,7 @@ class Walk:
                 yield name, CHANGING if self.read(kind, name, value) is CHANGING else inner
 
     def _attribute_values(self, thing: Any) -> list[tuple[str, Any]]:
-        """The attributes of an object by name; of what converts to an array, its values."""
+        """Return the attributes of an object by name; of one that converts to an array, its values."""
         inside, users = getattr(thing, "__dict__", {}), _is_users(type(thing).__module__)
         try:
             if hasattr(type(thing), "__array__") and not users:
@@ -226,7 +228,7 @@ class Walk:
         return sorted(held.items())
 
     def _describe_opaque(self, thing: Any) -> list[tuple[str, Any]]:
-        """The words for an object whose inside cannot be seen; it is `held` where they do not tell it from others."""
+        """Return the `repr` of an object without readable attributes, added to `held` if that is not unique."""
         try:
             shown = repr(thing)
         except Exception:
@@ -237,7 +239,7 @@ class Walk:
 
 
 def place_in(things: list, thing: Any) -> int:
-    """The place of this very thing in a list, to whose end it goes if it is not there."""
+    """Return the index of this very object in a list; append it if it is not there."""
     for k, other in enumerate(things):
         if other is thing:
             return k
@@ -265,7 +267,7 @@ def _is_plain_value(value: Any) -> bool:
 
 
 def _import_module(names: dict[str, Any], level: int, name: str) -> types.ModuleType | None:
-    """A module that a function with these globals imports when it is called; None where there is no such module."""
+    """Import the module that an import inside a function with these globals names; None if there is none."""
     try:
         full = name if not level else importlib.util.resolve_name("." * level + name, names.get("__package__"))
         return importlib.import_module(full) if _is_users(full) else sys.modules.get(full)
@@ -274,14 +276,14 @@ def _import_module(names: dict[str, Any], level: int, name: str) -> types.Module
 
 
 def _unwrap_function(thing: Any) -> Any:
-    """The function within one that `functools.wraps` or `jax.jit` made; None of others."""
+    """Return the function inside one made by `functools.wraps` or `jax.jit`; None for others."""
     # What jax.jit returns has no `__wrapped__` any more once it came from another process.
     state = thing.__getstate__() if type(thing).__name__ == "PjitFunction" else {}
     return getattr(thing, "__wrapped__", state.get("fun"))
 
 
 def _library_name(value: Any) -> str | None:
-    """The name of a function or a class of a library, or of one that is written in C; None of others."""
+    """Return the qualified name of a library's or C function or class; None for the user's own."""
     module, name = getattr(value, "__module__", None), getattr(value, "__qualname__", None)
     if not isinstance(module, str) or not isinstance(name, str):
         return None
@@ -293,7 +295,7 @@ def _library_name(value: Any) -> str | None:
 
 @functools.lru_cache(maxsize=1024)
 def _is_users(module: str | None) -> bool:
-    """True if a module is the user's: not of Python, and not of an installed package."""
+    """True if a module is the user's: not of Python's library, and not of an installed package."""
     root = (module or "__main__").split(".")[0]
     if root == "__main__":  # whatever started it
         return True
@@ -315,7 +317,7 @@ _OF_GLOBALS = frozenset("LOAD_NAME STORE_NAME DELETE_NAME LOAD_FROM_DICT_OR_GLOB
 
 @dataclasses.dataclass
 class ReadNames:
-    """The names in code, those in the functions inside of it included."""
+    """The names that occur in code, including its inner functions."""
 
     globals: set[str] = dataclasses.field(default_factory=set)
     attributes: set[str] = dataclasses.field(default_factory=set)
@@ -356,7 +358,7 @@ def names_of(code: types.CodeType) -> ReadNames:
 
 
 def source(function: Callable) -> str:
-    """The lines of a function, or its name where there are none to be read."""
+    """Return the source text of a function, or its name if there is none."""
     while isinstance(function, functools.partial):
         function = function.func
     try:
@@ -390,7 +392,7 @@ def shorten(text: str) -> str:
 
 @functools.lru_cache(maxsize=4096)
 def code_text(code: types.CodeType) -> str:
-    """A hash of what a function does, its numbers and names included; not of where it stands."""
+    """Return a hash of what a function does, with its constants and names; independent of its line numbers."""
     inner = [code_text(x) if isinstance(x, types.CodeType) else _constant_text(x) for x in code.co_consts]
     text = "\n".join([code.co_code.hex(), repr(code.co_names), repr(code.co_varnames), *inner])
     return hashlib.sha256(text.encode()).hexdigest()[:16]

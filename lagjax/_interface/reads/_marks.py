@@ -1,4 +1,4 @@
-"""`Marks`: where a walk found each value, so that the next call sees in a microsecond whether all are still there.
+"""`Marks`: where a walk found each value, to check within a microsecond whether all are unchanged.
 
 Values must be the same objects; an array is compared by its bytes, as it can be written to.
 """
@@ -21,14 +21,14 @@ SIZE = "how many attributes there are"
 
 
 class Marks:
-    """Places and what was found there: values that must be the same objects, and contents that must be equal."""
+    """Recorded places: values that must still be the same objects, and contents that must still be equal."""
 
     def __init__(self):
         self._values: list[tuple[Callable, Any, str, Any]] = []  # reader, place, key, value
         self._contents: list[tuple[Callable, Any, str | None, Any, Any]] = []  # reader, place, key, content, parts
 
     def mark(self, place: Any, key: str | None, value: Any) -> None:
-        """Note a value (or `ABSENT`) under its key in a dict, an object or a cell; with the key None, the content."""
+        """Record a value (or `ABSENT`) under a key of a dict, object or cell; with key None, the place's content."""
         if key is SIZE:
             self._contents.append((len, place, SIZE, len(place), None))
         elif key is not None:
@@ -39,7 +39,7 @@ class Marks:
 
     @property
     def keys(self) -> dict[tuple[int, str], Any]:
-        """The places with what they are read by, and each of them."""
+        """The places of recorded values, by (id of the place, key)."""
         return {
             (id(place), key): place
             for _, place, key, value in self._values
@@ -62,7 +62,7 @@ class Marks:
 
 
 def _key_reader(place: Any) -> Callable[[str, Any], Any]:
-    """A function of a key and of what to return if nothing is under it: a method written in C, where there is one."""
+    """Return a function (key, default) that reads a key of this place, in C where possible."""
     if isinstance(place, types.CellType):
         return lambda key, default: place.cell_contents
     if isinstance(place, dict | type):
@@ -71,7 +71,7 @@ def _key_reader(place: Any) -> Callable[[str, Any], Any]:
 
 
 def _content_reader(place: Any) -> tuple[Callable[[Any], Any], tuple | None]:
-    """A function of a place, of what is compared of its content; and what its identities are those of, to be kept."""
+    """Return a function of the place that gives the content to compare, and objects to keep alive, whose ids it has."""
     if not isinstance(place, Mapping | list | set | collections.deque):
         return _read_bytes, None
     if len(place) > LARGEST_CONTAINER:
@@ -82,7 +82,7 @@ def _content_reader(place: Any) -> tuple[Callable[[Any], Any], tuple | None]:
 
 
 def _read_bytes(place: Any) -> tuple:
-    """The shape, the dtype and the bytes of an array, or of what shows one; of a large one those of some numbers."""
+    """Return shape, dtype and bytes of an array-like; of a large array only the bytes of `SAMPLED` numbers."""
     array = np.asarray(place)
     whole = array.nbytes <= LARGEST_ARRAY
     numbers = array if whole else array.flat[np.linspace(0, array.size - 1, SAMPLED).astype(int)]

@@ -148,7 +148,7 @@ class Instruction(str):
     instead of 4, and more for Python's search for circles among them.
     """
 
-    type: ir.Type
+    type: ir.Type | None  # None of a store, which has no result
     reference: str
 
     def get_reference(self) -> str:

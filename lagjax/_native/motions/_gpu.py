@@ -26,7 +26,7 @@ from llvmlite import ir
 from lagjax._native.code._constants import LEAST_ORDER
 from lagjax._native.code._ir import DOUBLE, Code
 from lagjax._native.motions._gpu_entry import MOTION, TRANSPOSE, Entry, GpuForm, OneLane, motion_entry, transpose_entry
-from lagjax._native.series._taylor import TaylorSeries, order_for
+from lagjax._native.series._taylor import TaylorSeries, choose_order
 from lagjax._program import Unlowerable
 
 # Threads of a block, and blocks: a motion has as many as 132 multiprocessors hold with all registers of a thread, for
@@ -65,7 +65,7 @@ class GpuPrograms:
         self._transpose = functools.cache(self._assemble_transpose)
 
     def form(self, entry: Entry, rtol: float) -> GpuForm:
-        return form_for(entry, self._lane(), order_for(rtol))
+        return form_for(entry, self._lane(), choose_order(rtol))
 
     def motion(self, rtol: float) -> str:
         return self._motion(self.form(MOTION, rtol))

@@ -155,7 +155,7 @@ def compile_handler(name: str, arguments: int, results: int, write: Callable, *p
     (frame,) = code.arguments
     extension = load_at(frame, _EXTENSION, POINTER)
     with code.builder.if_then(code.builder.icmp_unsigned("!=", extension.it, null)):
-        _tell_version(code, extension)
+        _write_version_answer(code, extension)
         code.builder.ret(null)
     args, rets, attrs = (load_at(frame, offset, POINTER) for offset in (_ARGS, _RETS, _ATTRS))
     plan = load_at(load_at(element(attrs, 0), _SCALAR_VALUE, POINTER), 0, POINTER)
@@ -170,7 +170,7 @@ def compile_handler(name: str, arguments: int, results: int, write: Callable, *p
 _engines = []  # of what XLA has registered
 
 
-def _tell_version(code: Code, extension: Value) -> None:
+def _write_version_answer(code: Code, extension: Value) -> None:
     """Emit the answer to XLA's query, at registration, for the version of the interface."""
     metadata, short = load_at(extension, _METADATA, POINTER), ir.IntType(32)
     for offset, number in ((_MAJOR, MAJOR), (_MINOR, MINOR), (_TRAITS, 0)):

@@ -20,9 +20,9 @@ from lagjax._native.motions._integrator import Integrator
 from lagjax._native.motions._tangent import Tangent
 from lagjax._native.motions._threads import SLICE, run_in_slices, run_on_threads
 from lagjax._native.series._guards import Guards
-from lagjax._native.series._motion_parts import Chosen, MotionParts, Projection, choose_parameters
+from lagjax._native.series._motion_parts import ChosenParameters, MotionParts, Projection, choose_parameters
 from lagjax._native.series._table_reads import SET_NUMBERS
-from lagjax._native.series._taylor import TaylorSeries, order_for, size_of_series
+from lagjax._native.series._taylor import TaylorSeries, choose_order, size_of_series
 from lagjax._native.steps._run_records import RECORDED
 from lagjax._program import Borders, Nesting, Recurrent
 
@@ -77,7 +77,7 @@ class Steps(NamedTuple):
             yield row, self.table[first : first + count]
 
 
-class Begun(NamedTuple):
+class RunResults(NamedTuple):
     """The results of a run as a handler left it (`_handler.Handler`), perhaps incomplete; arrays of NumPy or JAX."""
 
     path: Any
@@ -142,7 +142,7 @@ class Kernel:
         return self._parts.borders
 
     @property
-    def chosen(self) -> Chosen | None:
+    def chosen(self) -> ChosenParameters | None:
         """The parameters of a member that the programs compute with; None for all."""
         return self._parts.chosen
 
@@ -162,13 +162,13 @@ class Kernel:
         return _CompiledRun(self._integrator(), self._rounds)
 
     @property
-    def _notes_crossings(self) -> bool:
+    def _records_crossings(self) -> bool:
         return self._guards is not None and self._guards.notes
 
     @property
     def ending_guards(self) -> int:
         """The number of guards that end a motion."""
-        return 0 if self._guards is None or self._notes_crossings else len(self._guards.directions)
+        return 0 if self._guards is None or self._records_crossings else len(self._guards.directions)
 
     @property
     def rest_size(self) -> int:
@@ -176,7 +176,7 @@ class Kernel:
         return Rest.size(self._forward.layout)
 
     def __call__(
-        self, ts, y0, params, rtol, atol, max_steps, room=0, begun: Begun | None = None, room_of_notes=0, order=0
+        self, ts, y0, params, rtol, atol, max_steps, room=0, begun: RunResults | None = None, room_of_notes=0, order=0
     ) -> Outcome:
         """Integrate from the states `y0` (N, 2n); all arrays are float64.
 
@@ -190,12 +190,12 @@ class Kernel:
         ts, y0, params = _contiguous_doubles(ts, y0, params)
         members, times = len(y0), ts.shape[1]
         if begun is not None:
-            begun = Begun(*(np.array(x, np.float64) for x in begun))
-        elif room == 0 and self.threads(members) == 1 and not self._notes_crossings and not order:
+            begun = RunResults(*(np.array(x, np.float64) for x in begun))
+        elif room == 0 and self.threads(members) == 1 and not self._records_crossings and not order:
             begun = self._begin_run(ts, y0, params, self.plan(rtol, atol, max_steps))
         if begun is None:
             shape = (times, self.states)
-            if self._notes_crossings and (guards := self._guards) is not None:
+            if self._records_crossings and (guards := self._guards) is not None:
                 shape = len(guards.directions) * (room_of_notes + 1), self.states + 1
             path, y_end = np.full((members, *shape), np.nan), np.empty((members, self.states))
             t_end, code, steps, rejected = np.empty((4, members))
@@ -215,14 +215,14 @@ class Kernel:
             record=table, next_row=rows,
         )  # fmt: skip
         numbers = dict(
-            **self._strides(ts, params), members=members, times=times, order=order or order_for(rtol),
+            **self._strides(ts, params), members=members, times=times, order=order or choose_order(rtol),
             max_steps=max_steps, room=room, room_of_notes=room_of_notes, rtol=rtol, atol=atol,
         )  # fmt: skip
         idle = self._forward(arrays, numbers, self.threads(members) if rest is None else 1, rest)
         table = None if table is None else table[: rows[0]]
         return _collect_results(path, y_end, t_end, code, steps, rejected, changes, idle, table)
 
-    def _begin_run(self, ts, y0, params, plan: Plan) -> Begun:
+    def _begin_run(self, ts, y0, params, plan: Plan) -> RunResults:
         """Run few members for one time slice, in one call of machine code."""
         members, times, states = len(y0), ts.shape[1], self.states
         guards = self.ending_guards
@@ -234,7 +234,7 @@ class Kernel:
         handler().begin(ctypes.addressof(plan), *arguments, *results, members, times, len(ts), len(params))
         path, y_end, *others, changes, rest = (block[begin:end] for begin, end in itertools.pairwise(ends))
         shaped = path.reshape(members, times, states), y_end.reshape(members, states)
-        return Begun._make([*shaped, *others, changes.reshape(members, guards), rest])
+        return RunResults._make([*shaped, *others, changes.reshape(members, guards), rest])
 
     def vjp(self, ts, params, record: Steps, path_ct, y_ct) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The vector–Jacobian product of a run, over its recorded steps.
@@ -304,7 +304,7 @@ class Kernel:
         """The plan with which a handler starts a run; valid as long as this kernel."""
         begin, run = self._forward.places
         size, rounds = self._forward.layout.size, self._forward.rounds
-        return Plan(begin, run, size, self.states, self.numbers, order_for(rtol), max_steps, rounds, rtol, atol)
+        return Plan(begin, run, size, self.states, self.numbers, choose_order(rtol), max_steps, rounds, rtol, atol)
 
     @property
     def rounds_of_rerun(self) -> int:
@@ -324,8 +324,8 @@ class Kernel:
         memory, both = [of.layout.size for of in (motion, derivative)], (motion, derivative)
         return DerivativePlan(
             *motion.places, *derivative.places, *memory, *(len(LANE) * of.layout.width for of in both), self.states,
-            self.numbers, order_for(rtol), max_steps, rounds, rounds * motion.layout.width, directions, others, rtol,
-            atol, floor_of(rtol, atol),
+            self.numbers, choose_order(rtol), max_steps, rounds, rounds * motion.layout.width, directions, others, rtol,
+            atol, small_size(rtol, atol),
         )  # fmt: skip
 
     @property
@@ -425,7 +425,7 @@ def _contiguous_doubles(*arrays) -> list[np.ndarray]:
     return [np.ascontiguousarray(x, dtype=np.float64) for x in arrays]
 
 
-def floor_of(rtol: float, atol: float) -> float:
+def small_size(rtol: float, atol: float) -> float:
     """The size below which a number counts as small: atol / rtol, or the default ratio if atol is 0."""
     return atol / rtol if atol > 0 else ATOL_OVER_RTOL
 

@@ -24,7 +24,7 @@ from lagjax._native.series._cotangents import Cotangents, add
 from lagjax._native.series._motion_parts import MotionParts
 from lagjax._native.series._tangent_memory import Directions
 from lagjax._native.series._taylor import TaylorSeries, double
-from lagjax._native.steps._run_records import instant_about
+from lagjax._native.steps._run_records import instant_tolerance
 from lagjax._program import pullback, pullback_and_entries, pushforward
 
 
@@ -259,7 +259,7 @@ class SeriesSum:
             at = frame.time(code.select(there, member, 0), code.select(there, index, 0))
             follows = (at - t) * h > 0.0
             if self.kicks:
-                follows = follows | ((h > 0.0) & (at >= t - instant_about(code, at)))
+                follows = follows | ((h > 0.0) & (at >= t - instant_tolerance(code, at)))
             return there & follows
 
         with code.repeat_while(follows_begin):
@@ -287,7 +287,7 @@ class ProjectedEnd:
         assert parts.projection is not None
         self.motion, self.dtypes, self.line = motion, parts.program.dtypes, parts.projection.state.line
 
-    def note_argument(self, frame: Frame) -> None:
+    def record_argument(self, frame: Frame) -> None:
         """Store the end of the series, for its tangents, as `moved`."""
         motion = self.motion
         moved = motion.move_state(frame, motion.increments(frame, frame.job("order"), frame["h"])[0])

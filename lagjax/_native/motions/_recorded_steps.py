@@ -84,7 +84,7 @@ class StepReplay:
                 frame.call(self._retract)
             frame.call(self.motion.coefficients, frame.job("order"))
             if self.retraction is not None:
-                self.retraction.note_start(frame)
+                self.retraction.record_start(frame)
             yield
             with code.loop(self.motion.width) as index, code.only_if(frame.lane(index)["member"] >= 0):
                 leave(frame, frame.lane(index), index)

@@ -19,7 +19,7 @@ from lagjax._native.motions._maps import CauchyProducts, OrderRecursion, Project
 from lagjax._native.motions._recorded_steps import StepReplay
 from lagjax._native.series._motion_parts import MotionParts
 from lagjax._native.series._tangent_memory import Directions
-from lagjax._native.steps._run_records import NUMBER, instant_about
+from lagjax._native.steps._run_records import NUMBER, instant_tolerance
 
 # `y_dot` is the tangent of the start, and becomes that of the end.
 JOB = job(
@@ -69,7 +69,7 @@ class Tangent:
         with self.replay.rounds(frame, rounds, self._advance_step):
             self._set_step_end(frame)
             if self.projected_end is not None:
-                self.projected_end.note_argument(frame)
+                self.projected_end.record_argument(frame)
             with code.loop((directions + (per_group - 1)) / per_group) as group:
                 for step in steps:
                     frame.call(step, group)
@@ -199,7 +199,7 @@ class Tangent:
         due = inside & ((at - of_motion["next_begin"]) * of_motion["h"] <= 0.0)
         if self.replay.parts.kicks:  # outputs at the end belong to the next step, forward in time
             next_begin, h = of_motion["next_begin"], of_motion["h"]
-            due = due & code.compare("!=", h, 0.0) & ~((h > 0.0) & (at >= next_begin - instant_about(code, at)))
+            due = due & code.compare("!=", h, 0.0) & ~((h > 0.0) & (at >= next_begin - instant_tolerance(code, at)))
         lane["s"] = code.select(due, at - of_motion["t"], 0.0)
         lane["is_due"] = code.flag(due)
 

@@ -35,7 +35,7 @@ class Guards(NamedTuple):
         return 2 * len(self.directions) if self.remembers else 0
 
 
-class Watched(NamedTuple):
+class WatchedProgram(NamedTuple):
     """A program whose last outputs are guards and their rounding errors, its series, and its borders."""
 
     program: Recurrent
@@ -44,17 +44,17 @@ class Watched(NamedTuple):
 
 
 @functools.lru_cache(maxsize=32)
-def append_guards(program: Recurrent, size: int, values: Recurrent, slides: bool) -> Watched:
+def append_guards(program: Recurrent, size: int, values: Recurrent, slides: bool) -> WatchedProgram:
     """A program of q̈ with guards as further outputs. Raises `Unlowerable` if a guard has no series."""
     count = len(values.line.outputs)
     whole = with_outputs(program, values.line, 2 * size + 1)
     require_lanes(whole.line)
     try:
         if (found := borders(whole, size, slides, count)) is not None:
-            return Watched(found.program, _series_of_guards(found.program, size, found.followed, count), found)
+            return WatchedProgram(found.program, _series_of_guards(found.program, size, found.followed, count), found)
     except Unlowerable:  # a switching number without a series, or more operations than that takes
         pass
-    return Watched(whole, _series_of_guards(whole, size, (), count), None)
+    return WatchedProgram(whole, _series_of_guards(whole, size, (), count), None)
 
 
 def require_lanes(line: StraightLine) -> None:

@@ -34,7 +34,7 @@ class Projection(NamedTuple):
     velocity_scale: Recurrent
 
 
-class Chosen(NamedTuple):
+class ChosenParameters(NamedTuple):
     """The parameters of a member that a motion computes with: those at `positions` among `of`; tables read the rest."""
 
     positions: tuple[int, ...]
@@ -57,7 +57,7 @@ class MotionParts(NamedTuple):
     nesting: Nesting
     projection: Projection | None = None
     borders: Borders | None = None
-    chosen: Chosen | None = None
+    chosen: ChosenParameters | None = None
 
     @property
     def pieces(self) -> int:
@@ -90,7 +90,7 @@ class MotionParts(NamedTuple):
 
     @classmethod
     def from_program(
-        cls, program: Recurrent, size: int, projection: Projection | None = None, chosen: Chosen | None = None
+        cls, program: Recurrent, size: int, projection: Projection | None = None, chosen: ChosenParameters | None = None
     ) -> "MotionParts":
         """The parts of a motion with `size` coordinates whose borders, if any, are ignored."""
         return cls(program, recurrences(program, size), Nesting(size), projection, chosen=chosen)
@@ -118,7 +118,7 @@ class MotionParts(NamedTuple):
 @functools.lru_cache(maxsize=16)
 def choose_parameters(
     program: Recurrent, projection: Projection | None, guards: Guards | None, motion: Recurrent | None, nesting: Nesting
-) -> "tuple[Recurrent, Projection | None, Guards | None, Recurrent | None, Chosen | None]":
+) -> "tuple[Recurrent, Projection | None, Guards | None, Recurrent | None, ChosenParameters | None]":
     """The programs reduced to the parameters that they compute with, tables reading the rest; and which ones these are.
 
     The same parameters are chosen in every row of the `nesting`; `motion` is the program of the first row alone.
@@ -160,7 +160,7 @@ def choose_parameters(
         projection and Projection(next(done), next(done)),
         guards and guards._replace(values=next(done), program=next(done)),
         None if motion is None else reduce_program(motion, 2 * nesting.base + 1, columns),
-        Chosen(positions, of),
+        ChosenParameters(positions, of),
     )
 
 

@@ -21,7 +21,7 @@ SET_NUMBERS = "set_numbers"
 
 
 class LookUps:
-    """The look-ups of a module; if its parameters are `Chosen`, tables are counted from `BESIDE`."""
+    """The look-ups of a module; if its parameters are `ChosenParameters`, tables are counted from `BESIDE`."""
 
     def __init__(self, module: ir.Module):
         self.module = module

@@ -267,7 +267,7 @@ def is_large(program: Recurrent, projection=None, guards=None, times: int = 1, m
     return operations + OPERATIONS_PER_COORDINATE * len(program.line.outputs) > LARGEST_LINE
 
 
-def order_for(rtol: float) -> int:
+def choose_order(rtol: float) -> int:
     """The order of the cheapest series at this tolerance: its terms fall by a factor e² each (Jorba & Zou, §3.2)."""
     return min(MAX_ORDER, max(LEAST_ORDER, math.ceil(2 - math.log(rtol) / 2)))
 

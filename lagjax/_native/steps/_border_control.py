@@ -22,7 +22,7 @@ from lagjax._native.steps._narrow_features import NarrowFeatures
 from lagjax._native.steps._roots import Roots
 from lagjax._native.steps._saltation import Saltation
 from lagjax._native.steps._step import absolute_tolerance
-from lagjax._native.steps._watch import Border, Crossed, GuardTable, Touch, end_at_border, joint_groups, reaches_border
+from lagjax._native.steps._watch import Border, Crossed, GuardTable, Touch, joint_groups, reaches_border, step_to_border
 from lagjax._program import CONE, TABLE, Borders, Jump, Nesting, gradient
 
 NOWHERE = 1e300  # a level that no switching number reaches
@@ -107,25 +107,25 @@ class BorderControl:
         frame["crossed"], frame["crossed_number"], frame["beyond"] = Crossed.NOTHING, 0.0, 0.0
         if self.pieces:
             self.knots.look(frame, h)
-            self._note_levels(frame)
+            self._record_levels(frame)
             if self.slides:
                 frame["slides"] = 0.0
                 for border in self.table.each(frame):
                     frame.assign(border.touch >= Touch.SLIDING, slides=1)
             for border in self.table.each(frame):
-                self._note_crossing(frame, border, degree, h)
+                self._record_crossing(frame, border, degree, h)
             if self.table.groups:
                 self._join_crossings(frame, h)
         self.narrow.look(frame, degree, h)
         cut = frame["nearest"] < 1.0
         if self.pieces and self.kicks is not None:
-            self.kicks.look_at_end(frame, self.roots, degree, h)
+            self.kicks.kick_at_end(frame, self.roots, degree, h)
             cut = cut | self.table.kicks(frame)
-        frame["h"] = end_at_border(frame)
+        frame["h"] = step_to_border(frame)
         frame.assign(cut, last=0.0, **self.forgotten)
         return frame.finish()
 
-    def _note_crossing(self, frame: Frame, border: Border, degree: Value, h: Value) -> None:
+    def _record_crossing(self, frame: Frame, border: Border, degree: Value, h: Value) -> None:
         """Record where a guard is crossed, if that is sooner than the crossing recorded before."""
         code, piece = frame.code, border.piece
         side, level, beyond = border.rule("side")(piece), border.level(piece), border.rule("beyond")(piece)
@@ -147,7 +147,7 @@ class BorderControl:
             self.roots.shorten_to(frame, degree, *tolerances, limits.RESOLVED)
             frame.call(self.roots.first_root, degree)
             self._refine_early_root(frame, degree)
-            self._note_first_root(frame, border, h, (undecided, beyond, leads), comes, idle)
+            self._record_first_root(frame, border, h, (undecided, beyond, leads), comes, idle)
 
     def _limit_growth(self, frame: Frame, border: Border, level: Value) -> None:
         """End the step where a cone's vector, of length `poly`, has grown by a fraction of its length.
@@ -177,7 +177,9 @@ class BorderControl:
         first = [abs(frame["poly", k]) for k in range(3)]  # the last ones may have become zero
         return (nothing & touches) | (first[0] + first[1] + first[2] < limits.TINY)
 
-    def _note_first_root(self, frame: Frame, border: Border, h: Value, piece: tuple, comes: Value, idle: Value) -> None:
+    def _record_first_root(
+        self, frame: Frame, border: Border, h: Value, piece: tuple, comes: Value, idle: Value
+    ) -> None:
         """Record the root of a guard if it is the first one, with the piece `beyond`, perhaps `undecided`.
 
         If `comes` holds, a border reached together with another one gets a step of its own, since each shifts tangents.
@@ -245,7 +247,7 @@ class BorderControl:
             self.roots.stretch(frame, degree, code.select(early() & (reach > 0.0) & (reach < 1.0), reach, 1.0))
             frame.call(self.roots.first_root, degree)
 
-    def _note_levels(self, frame: Frame) -> None:
+    def _record_levels(self, frame: Frame) -> None:
         """Store the levels of guards that change: table entries on both sides of a piece, and speeds of cones."""
         code = frame.code
         for g, guard in enumerate(self.borders.guards):
@@ -291,7 +293,7 @@ class BorderControl:
         counts = self.table.counts(frame)
         noted, ends = self.table.crosses_any(frame) & counts, self.table.crosses(frame, Crossed.GUARD) & counts
         with code.only_if(code.any_lane(noted)):
-            self.table.note_hit(frame, noted)
+            self.table.record_hit(frame, noted)
         with code.only_if(code.any_lane(ends)):
             state = motion.move_state(frame, motion.increments(frame, order, frame["h"])[0])
             inputs = state, [frame["t"] + frame["h"]], frame.vectors("params", motion.numbers)

@@ -12,10 +12,10 @@ from lagjax._native.steps._knots import Knots
 from lagjax._native.steps._retraction import Retraction
 from lagjax._native.steps._saltation import Saltation
 from lagjax._native.steps._step import absolute_tolerance
-from lagjax._native.steps._watch import Border, Crossed, Touch, end_at_border, reaches_border
+from lagjax._native.steps._watch import Border, Crossed, Touch, reaches_border, step_to_border
 from lagjax._program import SLIDE, Borders, Jump, Nesting, eliminate_dead_code
 
-_UNHELD = 1e6  # a share of a border that both sides do not push onto: those of others are near 0 … 1
+_NOT_HOLDING = 1e6  # a share of a border that both sides do not push onto: those of others are near 0 … 1
 
 
 class BorderCrossing:
@@ -85,7 +85,7 @@ class BorderCrossing:
             if self.borders.holding.release.outputs:
                 self._release_cones(frame)
             if self.kicks is not None:
-                self.kicks.note_pieces(frame)
+                self.kicks.record_pieces(frame)
             self._pass_borders(frame, crosses)
             if self.table.groups:
                 counts = stepped & self.table.crosses(frame, Crossed.GUARD)
@@ -116,11 +116,11 @@ class BorderCrossing:
         for k, j in enumerate(shaken):
             jump = abs(after[k] - before[k].value)
             least = abs(after[k]) * limits.ROUND_OFF + code.lanes_of(absolute_tolerance(frame))
-            self._release_borders(frame, going & (jump > least), [j])
+            self._stop_sliding(frame, going & (jump > least), [j])
         if shaken:
             self._redecide_dependents(frame, going)
 
-    def _release_borders(self, frame: Frame, where: Value, pieces: Container[int]) -> None:
+    def _stop_sliding(self, frame: Frame, where: Value, pieces: Container[int]) -> None:
         """Record that the motion neither touches the borders of some pieces nor slides along them."""
         for g, guard in enumerate(self.borders.guards):
             if guard.piece in pieces:
@@ -151,7 +151,7 @@ class BorderCrossing:
         if self.table.groups:
             is_first = self.table.crosses(frame, Crossed.GUARD, border.g)
             beyond = code.select(is_first, beyond, border.rule("beyond")(border.piece))
-        no_time = ~again & (abs(end_at_border(frame)) <= limits.NO_TIME * frame["smallest"])
+        no_time = ~again & (abs(step_to_border(frame)) <= limits.NO_TIME * frame["smallest"])
         no_time = (no_time | (~again & (frame["stops"] > 0.0))) & (frame["at_rest"] > 0.0)
         place, back, slide = border["piece"] + self.motion.parameters, border["back"], border["slide"]
         bounces = no_time & border.has("order", 2)  # by position
@@ -181,7 +181,7 @@ class BorderCrossing:
             order = code.lanes_of(code.as_double(on["order"]))
             gains = code.as_double(border["gains"])
             share, below, level = self.motion.followed_value(frame, border["piece"]), on.piece, on.rule("level")
-            unheld = hit & (abs(share) > _UNHELD) & ~on.is_cone
+            unheld = hit & (abs(share) > _NOT_HOLDING) & ~on.is_cone
             toward_zero = (code.lanes_of(abs(level.below) + abs(level.above)) > 0.0) & (below < 0.0)
             as_written = code.select(on.is_sign, 0.0, below + code.select(toward_zero, 0.0, 1.0))
             place = on["piece"] + self.motion.parameters
@@ -220,5 +220,5 @@ class BorderCrossing:
         if by_velocity:
             for j in range(self.motion.pieces):
                 frame.assign(kicked, j, stays=0.0 if j in by_velocity else 1.0)
-            self._release_borders(frame, kicked, by_velocity)
+            self._stop_sliding(frame, kicked, by_velocity)
             self._redecide_piece(frame, kicked)

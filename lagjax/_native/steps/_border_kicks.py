@@ -27,7 +27,7 @@ class Kicks:
             "counts": 1,  # 1 if the step is one that is recorded, be it of no length
         }
 
-    def note_pieces(self, frame: Frame) -> None:
+    def record_pieces(self, frame: Frame) -> None:
         """Store the pieces before the border."""
         with frame.code.loop(self.motion.pieces) as j:
             frame["kick_before", j] = self.table.piece(frame, j)
@@ -50,7 +50,7 @@ class Kicks:
     def _kicks_by_sign(self, j: int) -> bool:
         return j in self.in_time and self.borders.decisions[j].kind == SIGN
 
-    def look_at_end(self, frame: Frame, roots: Roots, degree: Value, h: Value) -> None:
+    def kick_at_end(self, frame: Frame, roots: Roots, degree: Value, h: Value) -> None:
         """End the last step with a kick where L jumps, to rounding, at the end time: final velocities are behind it."""
         code, one = frame.code, frame.constant(1.0)
         ends = (frame["last"] > 0.0) & (frame["forward"] > 0.0) & code.compare("!=", h, 0.0)

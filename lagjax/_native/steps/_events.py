@@ -49,7 +49,7 @@ class Events:
         rows = list(zip(guards.directions, piecewise, holds, strict=False))
         self.table = Columns(motion.module, ("direction", "piecewise", "holds"), rows)
         self.guard = self._evaluate_guards()
-        self.begin_sides = self._begin_sides()
+        self.begin_sides = self._initial_sides()
         self.note = self._write_change(output) if guards.notes else None
         self.look = self._find_changes()
 
@@ -90,7 +90,7 @@ class Events:
         watch.frame.call(self.guard, order, s)
         return watch.recall("guard")
 
-    def _begin_sides(self) -> Code:
+    def _initial_sides(self) -> Code:
         """Emit `(order)`: for lanes at the start of a run, the side of each surface they are on, into `side`.
 
         A guard that is zero to rounding takes its previous side: the remembered one, at least as large as the rounding
@@ -114,10 +114,10 @@ class Events:
                 for i in self.motion.form.each(code, count):
                     frame["measured", i, k] = out[i + k * count]
             for watch in self.table.each(frame):
-                self._begin_side(watch, order, fresh)
+                self._initial_side(watch, order, fresh)
         return frame.finish()
 
-    def _begin_side(self, watch: Watch, order: Value, fresh: Value) -> None:
+    def _initial_side(self, watch: Watch, order: Value, fresh: Value) -> None:
         """Set, for lanes at their start (`fresh`), the side of a guard, whether it changes there, and its contact."""
         frame, code, g = watch.frame, watch.code, watch.g
         direction, is_rounded = watch.number("direction"), self.guards.is_rounded
@@ -127,7 +127,7 @@ class Events:
             frame.constant(0.0) if self.guards.notes else 0.0 - direction
         )  # from where it can change in its direction
         if self.guards.remembers:
-            before, rate_noise = self._noted_numbers(watch)
+            before, rate_noise = self._recorded_numbers(watch)
         of_rate = abs(frame["h"]) * rate_noise
         lead, order_of_zero = self._leading_term(watch, order, limits.GUARD_NOISE * size + of_rate)
         away, from_there, moved = (abs(x) for x in (value, before, rate))
@@ -154,7 +154,7 @@ class Events:
         if is_rounded:
             watch.remember(fresh, zero=code.select(on_it, value, 0.0))
 
-    def _noted_numbers(self, watch: Watch) -> tuple[Value, Value]:
+    def _recorded_numbers(self, watch: Watch) -> tuple[Value, Value]:
         """The two parameters of a guard that a motion `remembers` (see `Guards`)."""
         first = self.motion.parameters + watch.g - 2 * self.count
         return watch.frame["params", first], watch.frame["params", first + self.count]
@@ -164,7 +164,7 @@ class Events:
         noise = limits.GUARD_NOISE * watch.recall("kept")
         if not self.guards.remembers:
             return noise
-        noted = abs(self._noted_numbers(watch)[0])
+        noted = abs(self._recorded_numbers(watch)[0])
         return watch.code.select((noted > noise) & (noted < float("inf")), noted, noise)
 
     def _leading_term(self, watch: Watch, order: Value, noise: Value) -> tuple[Value, Value]:
@@ -259,7 +259,7 @@ class Events:
         start, falls, rises = frame["poly", 0], falls.value, rises.value
         last, before = (self.roots.last_terms(frame, degree, first) for first in (0, 3))
         size = start + falls + rises
-        return (start > falls + last) & ~self._is_inaccurate(watch, last, before, size)
+        return (start > falls + last) & ~self._is_truncated(watch, last, before, size)
 
     def _search_roots(self, watch: Watch, order: Value, degree: Value, side: Value, moving: Value) -> None:
         frame, code, roots, h = watch.frame, watch.code, self.roots, watch.frame["h"]
@@ -272,7 +272,7 @@ class Events:
 
         def is_long():
             last, before = (roots.last_terms(frame, degree, first) for first in (0, 3))
-            return self._is_inaccurate(watch, last, before, roots.size(frame, degree))
+            return self._is_truncated(watch, last, before, roots.size(frame, degree))
 
         roots.shorten(frame, degree, is_long)
         frame["doubt"], frame["begin"], frame["closer"] = roots.last_terms(frame, degree), 0.0, 1.0
@@ -290,7 +290,7 @@ class Events:
         self._bisect_change(watch, order, ahead, moving & ~sound)
         watch.remember(moving, side_end=ahead.value)
 
-    def _is_inaccurate(self, watch: Watch, last: Value, before: Value, size: Value) -> Value:
+    def _is_truncated(self, watch: Watch, last: Value, before: Value, size: Value) -> Value:
         """The lanes where the last terms are large, or do not fall, so that the truncation error may be as large.
 
         Terms below the rounding error of the guard are accepted, as of a guard that leaves zero with a high power.
@@ -310,7 +310,7 @@ class Events:
             frame.call(self.roots.next_root, degree)
             root = frame["root"]
             is_root = searching() & self.roots.is_found(frame)
-            self._limit_sight(frame, searching() & ~is_root, self.roots.place(frame, 1.0))
+            self._limit_accurate_part(frame, searching() & ~is_root, self.roots.place(frame, 1.0))
             waits = is_root & self._ends_at_border(watch)
             watch.remember(waits, contact_end=Touch.CONTINUES)
             changes = is_root & ~waits
@@ -322,9 +322,9 @@ class Events:
                 frame.assign(goes_on, begin=root)
                 looking.value = code.flag(goes_on)
             looking.value = code.select(changes, looking.value, 0.0)
-        self._limit_sight(frame, searching(), frame["begin"] * frame["part"])
+        self._limit_accurate_part(frame, searching(), frame["begin"] * frame["part"])
 
-    def _limit_sight(self, frame: Frame, where: Value, seen: Value) -> None:
+    def _limit_accurate_part(self, frame: Frame, where: Value, seen: Value) -> None:
         """Lower, in some lanes, the fraction `seen` of the step up to which guards' polynomials are accurate."""
         frame.assign(where & (seen < frame["seen"]), seen=seen)
 
@@ -388,7 +388,7 @@ class Events:
         """Test a guard without series at the end of a part of the step; find a change before it by bisection."""
         frame, code, side, h = watch.frame, watch.code, ahead.value, watch.frame["h"]
         with code.only_if(code.any_lane(where)):
-            self._limit_sight(frame, where, frame.constant(limits.WITHOUT_SERIES))
+            self._limit_accurate_part(frame, where, frame.constant(limits.WITHOUT_SERIES))
             changes = where & (side * self._guard_value(watch, order, h) < 0.0)
             low, high = code.variable(frame.constant(0.0)), code.variable(h)
             with code.loop(limits.BISECTIONS):
@@ -412,7 +412,7 @@ class Events:
                 number = lane["noted_end", g]
                 lane["noted_end", g] = number + 1.0
                 with code.only_if(number < code.as_double(frame.job("room_of_notes"))):
-                    row = self._note_row(frame, lane["member"], g, code.as_integer(number))
+                    row = self._record_row(frame, lane["member"], g, code.as_integer(number))
                     frame.write("path", row, lane["reached"])
                     for i in self.motion.form.each(code, self.motion.states):
                         frame.write("path", row + 1 + i, lane["between", i])
@@ -422,11 +422,11 @@ class Events:
         """Write the change of each guard at the end of a member or, with `notes`, the number of its records."""
         with frame.code.loop(self.count) as g:
             if self.guards.notes:
-                row = self._note_row(frame, lane["member"], g, frame.job("room_of_notes"))
+                row = self._record_row(frame, lane["member"], g, frame.job("room_of_notes"))
                 frame.write("path", row, lane["noted", g])
             else:
                 frame.write("changes", lane["member"] * self.count + g, lane["change", g])
 
-    def _note_row(self, frame: Frame, member: Value, g: Value, number: Value) -> Value:
+    def _record_row(self, frame: Frame, member: Value, g: Value, number: Value) -> Value:
         rows = frame.job("room_of_notes") + 1
         return ((member * self.count + g) * rows + number) * (self.motion.states + 1)

@@ -20,7 +20,7 @@ class Knots:
         for c, j in clocks:
             self._end_at_knot(frame, c, j, h)
         if self.table.movable and len(clocks) > 1:
-            self._note_coincidence(frame, h)
+            self._record_coincidence(frame, h)
 
     def cross(self, frame: Frame, going: Value) -> None:
         """Enter the next piece of every table that has a knot at this instant."""
@@ -59,7 +59,7 @@ class Knots:
             sooner = sooner | (inside & at_end & code.compare("==", frame["crossed"], 0.0))
         frame.assign(sooner, nearest=left / size, crossed=Crossed.KNOT, crossed_number=float(c))
 
-    def _note_coincidence(self, frame: Frame, h: Value) -> None:
+    def _record_coincidence(self, frame: Frame, h: Value) -> None:
         """Mark knots of several tables at one instant, if one of them can depend on parameters."""
         code, end = frame.code, frame["nearest"] * abs(h)
         count, moves = frame.constant(0.0), frame.constant(0.0)

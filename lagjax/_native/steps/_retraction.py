@@ -78,7 +78,7 @@ class Retraction:
             for i in self.motion.form.each(frame.code, self.motion.states):
                 frame["y", i] = frame["unretracted", i]
 
-    def note_start(self, frame: Frame) -> None:
+    def record_start(self, frame: Frame) -> None:
         """Record whether a step, whose series is known, is the first one of its member.
 
         Record also which coordinates are moved by a border at the limit of its force: its share of a side is 0 or 1.

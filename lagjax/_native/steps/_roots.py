@@ -217,7 +217,7 @@ class Roots:
             touches = (frame["closer"] > 0.0) & (frame["poly", 0] > MEETS * error) & (here > frame["begin"])
             ends = is_root | (open & ((left_out > noise) | touches))
             with code.only_if(code.any_lane(ends)):
-                self._note_root(frame, here, (value, slope, error, bend), is_root, ends)
+                self._record_root(frame, here, (value, slope, error, bend), is_root, ends)
             root = code.intrinsic("sqrt", code.maximum(slope * slope + 2.0 * (down * value), 0.0))
             rising = slope > 0.0
             numerator = code.select(rising, slope + root, 2.0 * value)
@@ -229,7 +229,7 @@ class Roots:
             going.value = code.flag(now & ~ends & (after.value < 1.0))
         frame.assign(active(), is_root=0.0, root=x.value)
 
-    def _note_root(self, frame: Frame, here: Value, known: tuple[Value, ...], is_root: Value, ends: Value) -> None:
+    def _record_root(self, frame: Frame, here: Value, known: tuple[Value, ...], is_root: Value, ends: Value) -> None:
         """Store a root, or the end of the search; a root is improved by one bounded Newton step."""
         code, (value, slope, error, bend) = frame.code, known
         hop, back = self._rounding_distance(frame, error, bend), value / slope

@@ -11,7 +11,7 @@ RECORDED = 4  # numbers of a step that are written down before its state: time, 
 NUMBER = 3  # the place of that; when steps are in order a tangent writes there how large its last terms are
 
 
-def instant_about(code: Code, t: Value) -> Value:
+def instant_tolerance(code: Code, t: Value) -> Value:
     """The largest difference from time `t` that counts as zero."""
     return _INSTANT * abs(t)
 
@@ -56,7 +56,7 @@ class Output:
         frame["reached"] = after * forward
         if kicks is not None:
             with frame.where(kicks & (frame["h"] > 0.0)):
-                frame["reached"] = after - instant_about(code, after)
+                frame["reached"] = after - instant_tolerance(code, after)
 
         def due():
             return moving & (frame["due"] <= frame["reached"])

@@ -144,10 +144,10 @@ class Saltation:
         # The state at the border, the time there, and whether it is grazed, when the next step is at hand.
         return {"edge": self.motion.states, "edge_t": 1, "edge_grazes": 1}
 
-    def _note_edge(self, frame: Frame) -> None:
+    def _record_edge(self, frame: Frame) -> None:
         """Store the state at the end of a step, and the data of the border that it lies on."""
         motion, code = self.motion, frame.code
-        self.table.note_hit(frame, frame.constant(0.0) <= 0.0)
+        self.table.record_hit(frame, frame.constant(0.0) <= 0.0)
         moved = motion.move_state(frame, motion.increments(frame, frame.job("order"), frame["h"])[0])
         for i in motion.form.each(code, motion.states):
             frame["edge", i] = moved[i]
@@ -158,7 +158,7 @@ class Saltation:
         frame = self.motion.function("note_end")
         frame["is_hit"] = Hit.NONE
         with frame.code.only_if(frame.code.any_lane(self.table.crosses_any(frame))):
-            self._note_edge(frame)
+            self._record_edge(frame)
         return frame.finish()
 
     def _switching_choice(self, numbers: Callable) -> list:
@@ -195,7 +195,7 @@ class Saltation:
         code = frame.code
         frame["crossed"] = code.select(frame["has_after"] > 0.0, frame["crossed"], Crossed.NOTHING)
         with code.only_if(code.any_lane(self.table.crosses_any(frame))):
-            self._note_edge(frame)
+            self._record_edge(frame)
             gain, tables, entries = self._cotangent_jumps(frame, frame.vectors("pieces_after", motion.pieces))
             for row, i, part, place in self._row_places(frame, motion.form, range(self.jump.lower)):
                 add(frame, gain(row, i + part * self.base), "state_ct", place)

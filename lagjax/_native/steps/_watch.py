@@ -31,14 +31,14 @@ END_OF_STEP: Fields = {
 }
 
 
-def end_at_border(frame: Frame) -> Value:
+def step_to_border(frame: Frame) -> Value:
     """The length of the step up to the first border."""
     return frame["nearest"] * frame["planned"]
 
 
 def reaches_border(frame: Frame) -> Value:
     """True if the step reaches the first border."""
-    return frame.code.compare("==", frame["h"], end_at_border(frame))
+    return frame.code.compare("==", frame["h"], step_to_border(frame))
 
 
 class Touch(IntEnum):
@@ -232,7 +232,7 @@ class GuardTable(Columns):
 
     # ---- what a step ends at ----
 
-    def note_hit(self, frame: Frame, where: Value) -> None:
+    def record_hit(self, frame: Frame, where: Value) -> None:
         """Store, in some lanes, the pieces, and which switching numbers are zero at the border where the step ends.
 
         A guard on whose border a motion starts does not count, and a knot only if it is a parameter.

@@ -43,13 +43,21 @@ from lagjax._run.contacts._contact_motion import (
     RoundRecord,
     RowPlaces,
     contact_motion,
-    follow_known,
-    held_size,
-    slots_of,
+    count_held_rows,
+    follow_concrete,
+    held_row_count,
 )
 from lagjax._run.contacts._contact_search import find_start_width
 from lagjax._run.jumps import tolerances_of
-from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes, System, require_coefficients
+from lagjax._scene import (
+    ContactParams,
+    Contacts,
+    ContactScene,
+    ContactShapes,
+    FlatContacts,
+    System,
+    require_coefficients,
+)
 
 CHANGES = 1024  # the budget of changes of a motion whose crossings are asked for; what they record takes memory
 
@@ -82,7 +90,7 @@ def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int | Non
     """The motions of a batch whose system has contacts."""
     plan, *_ = _plan_contacts(batch.whole, max_transitions)
     if batch.is_known:
-        found = follow_rows(functools.partial(follow_known, plan), batch.member, batch.ts, batch.y0, batch.vectors)
+        found = follow_rows(functools.partial(follow_concrete, plan), batch.member, batch.ts, batch.y0, batch.vectors)
     else:
         found = batch.map_members(lambda problem: follow_in_doubles(functools.partial(contact_motion, plan), problem))
     ending, record, impacts = found
@@ -93,7 +101,7 @@ def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int | Non
 def _contact_outcome(plan: ContactPlan, problem: Problem) -> tuple[ContactEnding, RoundRecord, tuple]:
     if not problem.is_known:
         return follow_in_doubles(functools.partial(contact_motion, plan), problem)
-    return follow_in_numbers(functools.partial(follow_known, plan), problem)
+    return follow_in_numbers(functools.partial(follow_concrete, plan), problem)
 
 
 def note_sections(problem: Problem, functions: tuple, directions: tuple[int, ...], room: int) -> tuple:
@@ -105,7 +113,7 @@ def note_sections(problem: Problem, functions: tuple, directions: tuple[int, ...
     _require_valid_contacts(problem, *scenes)
     plan = dataclasses.replace(plan, sections=functions, directions=directions)
     ending, record, _ = jax.tree.map(jnp.asarray, _contact_outcome(plan, problem))
-    count = Shapes.from_system(problem.system, problem.layout, problem.params).count
+    count = ContactShapes.from_system(problem.system, problem.layout, problem.params).count
     which = jnp.maximum(record.contact - count, -1)
     return (which, record.t, record.y_next), ending.result, (ending.t, ending.y)
 
@@ -120,20 +128,22 @@ def _plan_contacts(problem: Problem, max_transitions: int | None) -> tuple[Conta
     tolerances, scene = tolerances_of(problem, "a scene with contacts", "an impact"), ContactScene(problem.system)
     wide = problem.double_precision if problem.is_single else problem
     with jax.enable_x64(True):
-        shapes = Shapes.from_system(problem.system, wide.layout, wide.params)
+        shapes = ContactShapes.from_system(problem.system, wide.layout, wide.params)
         r, d = shapes.rough.size, shapes.directions
         if problem.system.impacts == "poisson" and r and (shapes.count, d) != (1, 1):
             raise ValueError(
                 "With friction impacts='poisson' is for one contact in a plane: leave out slip, or take Newton's law, "
                 "impacts='simultaneous'."
             )
-        held = np.ones(held_size(shapes, wide.layout.size))
-        inside = InContact(wide.params, Contacts(np.ones(shapes.count), np.ones(r), np.ones((r, d)), held, np.ones(())))
+        held = np.ones(held_row_count(shapes, wide.layout.size))
+        inside = ContactParams(
+            wide.params, Contacts(np.ones(shapes.count), np.ones(r), np.ones((r, d)), held, np.ones(()))
+        )
         closed, free = (
             Problem.from_system(of, wide.layout, inside) for of in (scene, ContactScene(problem.system, is_open=True))
         )
-        flat, holds = Flat.from_system(problem.system, wide.layout, wide.params), closed
-        if held.size and (slots := slots_of(closed.derivation.lowered, flat)):
+        flat, holds = FlatContacts.from_system(problem.system, wide.layout, wide.params), closed
+        if held.size and (slots := count_held_rows(closed.derivation.lowered, flat)):
             scene = dataclasses.replace(scene, slots=slots)
             holds = Problem.from_system(scene, wide.layout, inside)
         if refusal := MachineCode().refuses(free) or holds.derivation.lowered.accelerations.lacks:
@@ -158,7 +168,7 @@ def _require_valid_contacts(problem: Problem, closed: Problem, free: Problem) ->
 def _require_positive_gaps(problem: Problem, closed: Problem, free: Problem) -> None:
     """Raise `ValueError` if the motion starts with a negative gap, beyond the rounding of its numbers."""
     derivation, n = closed.derivation.lowered, problem.layout.size
-    shapes = Shapes.from_system(problem.system, problem.layout, problem.params)
+    shapes = ContactShapes.from_system(problem.system, problem.layout, problem.params)
     y0, numbers = np.asarray(closed.y0, float), np.asarray(closed.vector, float)
     columns = np.concatenate([y0, np.asarray(closed.ts, float)[:1], numbers])
     of = derivation.evaluate(["residual", "jacobian"], list(columns))
@@ -195,7 +205,7 @@ def _trajectory(
     (q, qdot), end, (at, behind) = (tuple(map(restore, halves(y))) for y in (ending.path, ending.y, record.y_next))
     before = restore(record.qdot)
     known = record.contact, record.change, ending.rounds, ending.doubts, ending.doubted, record.impulse
-    names = Shapes.from_system(problem.system, problem.layout, problem.params).names
+    names = ContactShapes.from_system(problem.system, problem.layout, problem.params).names
     settings = RunSettings.from_problem(given, MachineCode(), max_transitions=budget)
     changes = ContactChanges(record.t, at, before, at, behind, *known, Names(names))
     return Trajectory(
@@ -218,19 +228,19 @@ def contact_forces(trajectory: Trajectory, name: str):
 
     def forces_of_member(q, qdot, times, params, _, contacts: Contacts):
         layout = Layout.from_state(*jax.tree.map(lambda x: x[0], (q, qdot)))
-        flat = Flat.from_system(system, layout, params)
-        inside = InContact(params, jax.tree.map(lambda x: x[0], contacts))
+        flat = FlatContacts.from_system(system, layout, params)
+        inside = ContactParams(params, jax.tree.map(lambda x: x[0], contacts))
         scene = ContactScene(system)
         if contacts.held.shape[-1]:
             whole = derivation_of(scene, layout, inside).lowered
-            scene = dataclasses.replace(scene, slots=slots_of(whole, flat))
+            scene = dataclasses.replace(scene, slots=count_held_rows(whole, flat))
         derivation = derivation_of(scene, layout, inside).with_numbers().lowered
         program = line_of(derivation.accelerations.multipliers)
         numbers = eqx.filter(params, eqx.is_array_like)
         given = [jnp.ravel(x) for x in jax.tree.leaves(numbers)]
 
         def evaluate_output(q, qdot, t, contacts):
-            state, inside = (layout.flatten(q), layout.flatten(qdot), t), InContact(params, contacts)
+            state, inside = (layout.flatten(q), layout.flatten(qdot), t), ContactParams(params, contacts)
             parts = [*state[:2], t[None], *given, *map(jnp.ravel, contacts)]
             forces = program(jnp.concatenate([jnp.asarray(x, layout.dtype) for x in parts]))
             own, normal, _ = scene.split_forces(flat, forces, derivation.position_count, inside)

@@ -23,7 +23,7 @@ from lagjax._run.contacts._impact_derivatives import construct_impulses
 from lagjax._run.contacts._places import ARRAYS, PLACES
 from lagjax._run.contacts._replay import ContactReplay, Played
 from lagjax._run.jumps import Found, JumpLaw, Mode, SceneCode, mask_rows
-from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes
+from lagjax._scene import ContactParams, Contacts, ContactScene, ContactShapes, FlatContacts
 from lagjax._tracing import Program, compose, lower
 
 LAW = JumpLaw(PLACES, LOOPS, ("RESTITUTION", "MU"), ("DOUBTS", "DOUBTED"))
@@ -81,7 +81,7 @@ class SearchedScene(NamedTuple):
     """
 
     replay: ContactReplay
-    flat: Flat
+    flat: FlatContacts
     coefficients: Program | None
 
 
@@ -99,7 +99,7 @@ def contact_motion(
     return _arrange_outcome(scene, *scene.replay.follow(*given), given[:3])
 
 
-def follow_known(plan: ContactPlan, layout: Layout, params: PyTree, ts, y0, vectors) -> tuple:
+def follow_concrete(plan: ContactPlan, layout: Layout, params: PyTree, ts, y0, vectors) -> tuple:
     """The motions of N members with concrete numbers: `y0` (N, 2n), `ts` (N or 1, T), `vectors` (N or 1, P).
 
     `params` are those of one member. The records are as long as the largest number of changes.
@@ -117,7 +117,7 @@ def follow_known(plan: ContactPlan, layout: Layout, params: PyTree, ts, y0, vect
     return _arrange_outcome(scene, found, *scene.replay.read(found), ())
 
 
-def _coefficients_at(flat: Flat, params: PyTree, vector) -> list[np.ndarray]:
+def _coefficients_at(flat: FlatContacts, params: PyTree, vector) -> list[np.ndarray]:
     """The coefficients e and μ for the numbers (P,) of parameters of this structure."""
     numbers, structure = jax.tree.flatten(eqx.filter(params, eqx.is_array_like))
     parts = np.split(vector, np.cumsum([np.size(x) for x in numbers])[:-1])
@@ -160,8 +160,8 @@ def _arrange_outcome(scene: SearchedScene, found: Found, row, played: Played, in
 
 def scene_of(plan: ContactPlan, layout: Layout, params: PyTree, times: int) -> SearchedScene:
     """The prepared scene for parameters of this structure and a number of outputs."""
-    flat = Flat.from_system(plan.scene.system, layout, params)
-    inside = InContact(params, opened(flat, layout.size))
+    flat = FlatContacts.from_system(plan.scene.system, layout, params)
+    inside = ContactParams(params, opened(flat, layout.size))
     numbers = vector_of(eqx.filter(inside, eqx.is_array_like))
     system = plan.scene.system
     closed, other, whole = (
@@ -192,7 +192,7 @@ def _make_scene(
             return make_flow(of, scene.path, find().guards(remembers=True))
 
         modes.append(Mode(make, watches, find, make_lines))
-    doing, inputs = k + r + r * d + held_size(shapes, n) + 1, len(derivation.scalar_shapes)
+    doing, inputs = k + r + r * d + held_row_count(shapes, n) + 1, len(derivation.scalar_shapes)
     response = whole.accelerations.impact_response(places.all, doing, open_derivation)
     bends = response.select_outputs(range(len(response.line.outputs))[-len(places.all) :][:k])
     acceleration = line_of((open_derivation if corners is None else derivation).accelerations.program, n)
@@ -219,39 +219,45 @@ def _make_scene(
     return SearchedScene(ContactReplay(searched, flow), flat, _lower_coefficients(flat, derivation.numbers.params))
 
 
-def _lower_coefficients(flat: Flat, numbers: PyTree) -> Program | None:
+def _lower_coefficients(flat: FlatContacts, numbers: PyTree) -> Program | None:
     try:
         return lower(lambda p: jnp.concatenate([flat.restitution(p), flat.friction(p)]), numbers)
     except Unlowerable:
         return None
 
 
-def _flat_functions(derivation: Derivation, scene: ContactScene, structure, code: tuple) -> Flat:
+def _flat_functions(derivation: Derivation, scene: ContactScene, structure, code: tuple) -> FlatContacts:
     """The functions of contacts; `code` and `structure` are the parts of the parameters that are not numbers."""
     zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), derivation.numbers)
-    return Flat.from_system(scene.system, derivation.layout, eqx.combine(zeros, structure.unflatten(code)).params)
+    return FlatContacts.from_system(
+        scene.system, derivation.layout, eqx.combine(zeros, structure.unflatten(code)).params
+    )
 
 
-def opened(flat: Flat, n: int) -> Contacts:
+def opened(flat: FlatContacts, n: int) -> Contacts:
     """The contact states, for n coordinates, in which all are open."""
-    (k, r), d, held = (flat.shapes.count, flat.rough.size), flat.shapes.directions, held_size(flat.shapes, n)
+    (k, r), d, held = (flat.shapes.count, flat.rough.size), flat.shapes.directions, held_row_count(flat.shapes, n)
     return Contacts(np.zeros(k), np.ones(r), np.ones((r, d)), np.zeros(held), np.zeros(()))
 
 
-def held_size(shapes: Shapes, n: int) -> int:
+def held_row_count(shapes: ContactShapes, n: int) -> int:
     """The size of `Contacts.held` for n coordinates."""
     rows = shapes.count + shapes.rough.size * shapes.directions
     return rows if rows > n else 0
 
 
-def slots_of(whole: Derivation, flat: Flat) -> tuple[int, int] | None:
+def count_held_rows(whole: Derivation, flat: FlatContacts) -> tuple[int, int] | None:
     """The most independent rows of gaps, and of velocities, active at once; None to keep all rows.
 
     They are ranks at random states, for rows without corners. The slips of few contacts may add more to the rank of
     their gaps than those of all do: all sets whose gaps leave some rank are tested.
     """
     places, shapes, n = RowPlaces.from_derivation(whole, flat), flat.shapes, whole.layout.size
-    if not held_size(shapes, n) or shapes.count > flat.gap_count or corners_of(whole, places.all, shapes) is not None:
+    if (
+        not held_row_count(shapes, n)
+        or shapes.count > flat.gap_count
+        or corners_of(whole, places.all, shapes) is not None
+    ):
         return None
     rows = [sample.toarray() for _, sample in whole.accelerations.samples()]
     own = np.setdiff1d(np.arange(len(rows[0])), places.all)
@@ -267,10 +273,10 @@ def slots_of(whole: Derivation, flat: Flat) -> tuple[int, int] | None:
     sets = [list(x) for size in range(1, gaps) for x in itertools.combinations(range(len(slips)), size)]
     most = [rank(normal[x], slips[x].ravel()) - rank(normal[x]) for x in sets]
     slots = gaps, max([*most, rank(places.normal, slips.ravel()) - gaps])
-    return slots if sum(slots) < held_size(shapes, n) else None
+    return slots if sum(slots) < held_row_count(shapes, n) else None
 
 
-def _all_multipliers(derivation: Derivation, scene: ContactScene, flat: Flat) -> Program:
+def _all_multipliers(derivation: Derivation, scene: ContactScene, flat: FlatContacts) -> Program:
     """The program of all multipliers; with slots those of the contacts, (k + r d,)."""
     if scene.slots is None:
         return derivation.accelerations.multipliers
@@ -296,7 +302,7 @@ class RowPlaces(NamedTuple):
         return (*self.normal.tolist(), *self.tangential.ravel().tolist())
 
     @classmethod
-    def from_derivation(cls, derivation, flat: Flat) -> "RowPlaces":
+    def from_derivation(cls, derivation, flat: FlatContacts) -> "RowPlaces":
         total, (r, d) = derivation.shape("jacobian")[0], (flat.rough.size, flat.shapes.directions)
         gaps_end, slips = derivation.position_count, total - r * d
         one_way = flat.shapes.count - flat.gap_count
@@ -318,7 +324,7 @@ def _contact_watches(
     if turns and not scene.is_open:
         corners = corners_of(derivation, RowPlaces.from_derivation(derivation, flat).all, shapes)
 
-    def values_at(y, inside: InContact, *forces):
+    def values_at(y, inside: ContactParams, *forces):
         user, (closed, sticks, direction, _, near) = eqx.filter(inside.params, eqx.is_array_like), inside.contacts
         state = (*halves(y[:-1]), y[-1])
         open_values = jnp.concatenate([flat.gaps(state[0], state[2], user), flat.one_way(*state, user)])

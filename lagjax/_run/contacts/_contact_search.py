@@ -2,7 +2,7 @@
 
 A contact has watches that stay positive: its gap, or one-way velocity, while it is open, its normal force λ while it is
 closed; with friction the slip in its direction while it slides, μ²λ² − f² while it sticks. One program serves all
-contacts in any state (`InContact`). When a watch becomes negative,
+contacts in any state (`ContactParams`). When a watch becomes negative,
 
     a gap             impulses, if the contact approaches (`_law`); else the contact closes
     λ                 it opens
@@ -803,7 +803,7 @@ def find_change(scene: Scene, member: Member, hits: bool, row: Entry, room: Room
         mu, rest = room.free, room.free[r:]
         for c in range(r):
             mu[c] = 0.0
-    ask_rates(scene, member, hits, row, room)
+    require_rates(scene, member, hits, row, room)
     find_impulses(k, r, d, rough, mu, coupling, rates, push, stuck, direction, targets, impulses, rest)
     if hits:
         wrong = is_violated(scene, member, row, room)
@@ -824,7 +824,7 @@ def find_change(scene: Scene, member: Member, hits: bool, row: Entry, room: Room
 
 
 @loop
-def ask_rates(scene: Scene, member: Member, hits: bool, row: Entry, room: Room):
+def require_rates(scene: Scene, member: Member, hits: bool, row: Entry, room: Room):
     """Write the rates required after an impact by its law, unless set; else zero for closed and sticking contacts."""
     k, d, e, targets = scene.k, scene.d, member.restitution, room.targets
     did = member.x[2 * scene.n + 1 + scene.numbers :]

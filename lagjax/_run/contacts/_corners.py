@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._program import Unlowerable, find_corners, is_smooth, with_outputs
-from lagjax._scene import Shapes
+from lagjax._scene import ContactShapes
 from lagjax._tracing import Program
 
 
@@ -24,7 +24,7 @@ class Corners(NamedTuple):
     sides: Program
 
 
-def corners_of(derivation, rows: tuple[int, ...], shapes: Shapes) -> Corners | None:
+def corners_of(derivation, rows: tuple[int, ...], shapes: ContactShapes) -> Corners | None:
     """The corners of contacts, which have these `rows` of all constraints, slips last; None without any.
 
     Raises `ValueError` for a gap that is zero where it has its corner.

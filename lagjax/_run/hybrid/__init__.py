@@ -42,7 +42,7 @@ from lagjax._run._trajectory import (
     step_counts,
 )
 from lagjax._run.hybrid._mode import Transition
-from lagjax._run.hybrid._transition_motion import HybridPlan, follow_known, hybrid_motion
+from lagjax._run.hybrid._transition_motion import HybridPlan, follow_concrete, hybrid_motion
 from lagjax._run.hybrid._transition_search import IN_ONE_PLACE
 from lagjax._run.jumps import tolerances_of
 from lagjax._scene import System, present_system, require_system
@@ -154,7 +154,7 @@ def follow_modes(
     limits = scene.max_transitions, tolerances, problem.is_single
     plan = HybridPlan(tuple(modes), tuple(modes.values()), tuple(scene.transitions), *limits)
     if problem.is_known and is_concrete(start):
-        found = jax.device_put(follow_in_numbers(functools.partial(follow_known, plan), problem, start))
+        found = jax.device_put(follow_in_numbers(functools.partial(follow_concrete, plan), problem, start))
     else:
         found = follow_in_doubles(functools.partial(hybrid_motion, plan), problem, start)
     known = dataclasses.replace(problem, ts=jax.lax.stop_gradient(problem.ts))

@@ -330,13 +330,13 @@ def follow_blows(scene: Scene, member: Member, mode: int, backwards: bool, x: Fl
 @loop
 def name_end(scene: Scene, record: Entry, end: float) -> int:
     """The result of a motion that has used up its budget of transitions before `end`."""
-    if go_in_turn(scene, record):
+    if repeats_at_instant(scene, record):
         return IN_TURN
-    return ZENO if pile_up(scene, record, end) else TOO_MANY
+    return ZENO if bounces_converge(scene, record, end) else TOO_MANY
 
 
 @loop
-def pile_up(scene: Scene, record: Entry, end: float) -> bool:
+def bounces_converge(scene: Scene, record: Entry, end: float) -> bool:
     """True if the times of a used-up budget of transitions converge geometrically to a limit before `end`.
 
     Aitken's extrapolation of the last times, taken far enough apart that a pattern of two, three or six transitions (a
@@ -358,7 +358,7 @@ def pile_up(scene: Scene, record: Entry, end: float) -> bool:
 
 
 @loop
-def go_in_turn(scene: Scene, record: Entry) -> bool:
+def repeats_at_instant(scene: Scene, record: Entry) -> bool:
     """True if the last transitions of a used-up budget, of several kinds, are at one instant without convergence."""
     size, several, before = scene.most - 1, False, -INFINITY
     if size < IN_ONE_PLACE:

@@ -6,6 +6,8 @@ matrix at states nearby, the linearised motion. What follows is NumPy and senten
 `_differences`), `_constraint_checks` (with contacts), `_mass`, `_jumps_near`, `_stiffness`.
 """
 
+from collections.abc import Iterator
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -69,7 +71,7 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
     require_number(t, "t")
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves((q, qdot, t, params))):
         raise ValueError("check needs numbers, not traced values: call it outside of jit, vmap and grad, on one state.")
-    reported = _check_inputs(layout, q, qdot, t, params)
+    reported = list(_check_inputs(layout, q, qdot, t, params))
     if any(finding.level == "error" for finding in reported):
         return Findings.sort(reported)
     found, omitted = _scene_findings(system, q, qdot, t, params)
@@ -82,8 +84,8 @@ def _scene_findings(system, q, qdot, t, params) -> tuple[list[Finding], str]:
     if layout.size > forms.LARGEST_DENSE and not derivation_of(system, layout, params).form.is_sparse:
         system = replace_functions(system, {}, "array")
     scene = CheckedScene.from_state(system, layout, q, qdot, t, params)
-    reported = _derivative_checks.findings(scene) + _check_dissipation(scene) + _constraint_checks.findings(scene)
-    reported += _constraint_checks.contact_findings(scene) + _mass.findings(scene)
+    reported = [*_derivative_checks.findings(scene), *_check_dissipation(scene), *_constraint_checks.findings(scene)]
+    reported += [*_constraint_checks.contact_findings(scene), *_mass.findings(scene)]
     if scene.is_large:
         reported += [] if any(finding.level == "error" for finding in reported) else _check_acceleration(scene)
         return [*reported, *_check_time(scene)], (
@@ -100,18 +102,17 @@ def _scene_findings(system, q, qdot, t, params) -> tuple[list[Finding], str]:
 # ---- the arguments ---------------------------------------------------------------------------------------------------
 
 
-def _check_inputs(layout: Layout, q, qdot, t, params) -> list[Finding]:
-    reported = []
+def _check_inputs(layout: Layout, q, qdot, t, params) -> Iterator[Finding]:
     for name, tree in (("q", q), ("qdot", qdot), ("t", t), ("params", params)):
         for where, value in not_finite(tree, name):
             message = f"{where} is {value}: every number must be finite."
-            reported.append(Finding("not_finite", "error", (where,), message))
-    reported += _check_precision(layout, q, qdot, params)
-    return reported + _check_small_coordinates(layout, q)
+            yield Finding("not_finite", "error", (where,), message)
+    yield from _check_precision(layout, q, qdot, params)
+    yield from _check_small_coordinates(layout, q)
 
 
 def _check_small_coordinates(layout: Layout, q) -> list[Finding]:
-    """Advice where an array of coordinates is so small beside another one that the default atol loses its digits."""
+    """Return advice if an array of coordinates is so small beside another that the default atol is too coarse."""
     rtol, eps = DEFAULT_RTOL, float(np.finfo(layout.dtype).eps)
     paths = jax.tree_util.tree_leaves_with_path(q)
     leaves = {"q" + jax.tree_util.keystr(path): float(np.abs(np.asarray(leaf)).max(initial=0)) for path, leaf in paths}
@@ -130,8 +131,7 @@ def _check_small_coordinates(layout: Layout, q) -> list[Finding]:
     return [Finding("small_state", "advice", small, message)]
 
 
-def _check_precision(layout: Layout, q, qdot, params) -> list[Finding]:
-    reported = []
+def _check_precision(layout: Layout, q, qdot, params) -> Iterator[Finding]:
     if layout.dtype == np.float32:
         wide = any(getattr(leaf, "dtype", None) == np.float64 for leaf in jax.tree.leaves((q, qdot, params)))
         what = "float64 was given, but JAX makes float32 of it" if wide else "The state is in float32"
@@ -141,7 +141,7 @@ def _check_precision(layout: Layout, q, qdot, params) -> list[Finding]:
             f"its size; solvers of diffrax, on a GPU or where they are asked for, compute in float32. For more digits, "
             f"{do}pass float64."
         )
-        reported.append(Finding("single_precision", "advice", layout.names, message))
+        yield Finding("single_precision", "advice", layout.names, message)
     integers = [
         "params" + jax.tree_util.keystr(path)
         for path, leaf in jax.tree_util.tree_leaves_with_path(params)
@@ -152,15 +152,14 @@ def _check_precision(layout: Layout, q, qdot, params) -> list[Finding]:
             f"{join_names(integers)}: integers. Their products wrap around when they overflow, and nothing can be "
             "differentiated by them. Write 1.0 for 1 unless it counts something."
         )
-        reported.append(Finding("integer_parameter", "advice", tuple(integers), message))
-    return reported
+        yield Finding("integer_parameter", "advice", tuple(integers), message)
 
 
 # ---- what the forces do ----------------------------------------------------------------------------------------------
 
 
 def _check_dissipation(scene: CheckedScene) -> list[Finding]:
-    """A warning where the dissipation function puts energy into the motion at some velocity."""
+    """Return a warning if the dissipation function adds energy to the motion at some velocity."""
     power, size = scene.measured.power.T
     usable = np.isfinite(power)
     gains = power < -np.sqrt(np.finfo(scene.layout.dtype).eps) * size

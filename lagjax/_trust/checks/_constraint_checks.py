@@ -1,5 +1,6 @@
-"""Constraints and contacts: whether constraints are satisfied, and whether one follows from others; whether the motion
-starts inside a contact, or moves into one that is closed; and whether each has a gradient."""
+"""Checks of constraints and contacts: satisfied, independent, with a gradient, and not violated at the start."""
+
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -7,38 +8,38 @@ import numpy as np
 
 from lagjax._equations import ROUNDINGS, dependent_rows, require_consistent
 from lagjax._interface import Layout, join_names
-from lagjax._scene import Flat
+from lagjax._scene import FlatContacts
 from lagjax._trust.checks._findings import Finding
 from lagjax._trust.checks._mass import null_velocities
 from lagjax._trust.checks._scene_at_start import CheckedScene
 
 
-def findings(scene: CheckedScene) -> list[Finding]:
+def findings(scene: CheckedScene) -> Iterator[Finding]:
     if not scene.motion.constrained:
-        return []
+        return
     residual, jacobian = scene.residual, scene.measured.jacobian
     names = scene.system.constraint_names(scene.layout, scene.arguments[3])
     bad = [k for k in range(len(names)) if not (np.isfinite(residual[k]) and np.isfinite(jacobian[0, k]).all())]
     if bad:
-        return [_check_finite(names[k], residual[k]) for k in bad]
+        yield from (_check_finite(names[k], residual[k]) for k in bad)
+        return
     positions = scene.derivation.position_count
     idle = [k for k in range(len(names)) if not jacobian[0, k].any()]
-    reported = [_check_zero_gradients(names[k], k >= positions, residual[k], jacobian[:, k]) for k in idle]
-    reported += _check_affine(names, jacobian, positions, scene.layout)
+    yield from (_check_zero_gradients(names[k], k >= positions, residual[k], jacobian[:, k]) for k in idle)
+    yield from _check_affine(names, jacobian, positions, scene.layout)
     if idle:
-        return reported
+        return
     q, qdot, t, params = scene.arguments
     try:
         require_consistent(scene.system, scene.layout, np.asarray([t], scene.layout.dtype), q, qdot, params)
     except ValueError as error:
         where = tuple(name for name in names if name in str(error))
-        return [*reported, Finding("inconsistent_start", "error", where, str(error))]
-    if scene.is_large:
-        return reported
-    augmented = scene.augmented[0]
-    if not np.isfinite(augmented).all() or len(null_velocities(augmented)):
-        return reported
-    return [*reported, *_check_independent(jacobian[0] @ np.linalg.solve(augmented, jacobian[0].T), names)]
+        yield Finding("inconsistent_start", "error", where, str(error))
+        return
+    if not scene.is_large:
+        augmented = scene.augmented[0]
+        if np.isfinite(augmented).all() and not len(null_velocities(augmented)):
+            yield from _check_independent(jacobian[0] @ np.linalg.solve(augmented, jacobian[0].T), names)
 
 
 def _check_finite(name: str, value) -> Finding:
@@ -48,7 +49,7 @@ def _check_finite(name: str, value) -> Finding:
 
 
 def _check_zero_gradients(name: str, of_velocities: bool, value, rows: np.ndarray) -> Finding:
-    """A constraint whose gradient is zero: of no use here, and often an inequality or a square."""
+    """Return the finding for a constraint with zero gradient, which is often an inequality or a square."""
     if of_velocities:
         message = (
             f"{name} does not depend on qdot here, so that no force can keep it. Give what depends on q alone as "
@@ -69,9 +70,8 @@ def _check_zero_gradients(name: str, of_velocities: bool, value, rows: np.ndarra
     return Finding("constraint_zero_gradient", "error", (name,), message)
 
 
-def _check_affine(names, jacobian, positions: int, layout: Layout) -> list[Finding]:
-    """Warnings where ∂a/∂q̇ changes with q̇; the last half of the states differs from the state itself in q̇ alone."""
-    reported = []
+def _check_affine(names, jacobian, positions: int, layout: Layout) -> Iterator[Finding]:
+    """Yield warnings where ∂a/∂q̇ changes with q̇; the last half of the sampled states differs in q̇ alone."""
     for k in range(positions, len(names)):
         others = jacobian[(len(jacobian) + 1) // 2 :, k]
         others = others[np.isfinite(others).all(axis=1)]
@@ -81,32 +81,29 @@ def _check_affine(names, jacobian, positions: int, layout: Layout) -> list[Findi
                 f"{names[k]} is not affine in qdot: its derivative by qdot changes with qdot. The principle of "
                 "d'Alembert and Lagrange is for a(q, qdot) = A(q) qdot + b(q); write it so, or take it out."
             )
-            reported.append(Finding("velocity_constraint_not_affine", "warning", (names[k],), message))
-    return reported
+            yield Finding("velocity_constraint_not_affine", "warning", (names[k],), message)
 
 
-def _check_independent(schur: np.ndarray, names: list[str]) -> list[Finding]:
-    """Advice for each constraint that is a combination of others, from the Schur complement (m, m)."""
-    reported = []
+def _check_independent(schur: np.ndarray, names: list[str]) -> Iterator[Finding]:
+    """Yield advice for each constraint that depends linearly on others, from the Schur complement (m, m)."""
     for row, factors in dependent_rows(schur).items():
         others = tuple(name for name, factor in zip(names, factors, strict=True) if factor)
         message = (
             f"{names[row]} follows from {join_names(others)} here. The motion is right, but how their forces are "
             "shared is not determined; the shortest multipliers are given. Drop it if its force is wanted."
         )
-        reported.append(Finding("dependent_constraints", "advice", (names[row], *others), message))
-    return reported
+        yield Finding("dependent_constraints", "advice", (names[row], *others), message)
 
 
-def contact_findings(scene: CheckedScene) -> list[Finding]:
+def contact_findings(scene: CheckedScene) -> Iterator[Finding]:
     if scene.system.contacts is None:
-        return []
+        return
     (q, qdot, t, numbers), layout = scene.state, scene.layout
-    flat = Flat.from_system(scene.system, layout, scene.arguments[3])
+    flat = FlatContacts.from_system(scene.system, layout, scene.arguments[3])
     gaps, rates = jax.jvp(lambda q, t: flat.gaps(q, t, numbers), (q, t), (qdot, jnp.ones_like(t)))
     slopes = jax.jacfwd(lambda q: flat.gaps(q, t, numbers))(q)
     gaps, rates, slopes = (np.asarray(x) for x in (gaps, rates, slopes))
-    closed, reported = ROUNDINGS * np.finfo(layout.dtype).eps, []
+    closed = ROUNDINGS * np.finfo(layout.dtype).eps
     near_zero = closed * (np.abs(slopes) @ np.abs(np.asarray(q)) + np.abs(gaps))
     at_rest = closed * (np.abs(slopes) @ np.abs(np.asarray(qdot)))
     measured = zip(flat.shapes.names, gaps, rates, slopes, near_zero, at_rest, strict=False)
@@ -117,14 +114,13 @@ def contact_findings(scene: CheckedScene) -> list[Finding]:
                 "it as a distance, not as a square or a product."
             )
             level = "error" if abs(gap) <= near else "warning"
-            reported.append(Finding("contact_zero_gradient", level, (name,), message))
+            yield Finding("contact_zero_gradient", level, (name,), message)
         elif gap < -near:
             message = f"The gap {name} is {gap:.6g}: the motion starts inside. Gaps stay >= 0."
-            reported.append(Finding("contact_inside", "error", (name,), message))
+            yield Finding("contact_inside", "error", (name,), message)
         elif abs(gap) <= near and rate < -slow:
             message = (
                 f"The gap {name} is closed and changes by {rate:.6g} per unit of time: the motion begins with an "
                 "impact at once. Start it with a velocity along the contact if that is not meant."
             )
-            reported.append(Finding("contact_inwards", "advice", (name,), message))
-    return reported
+            yield Finding("contact_inwards", "advice", (name,), message)

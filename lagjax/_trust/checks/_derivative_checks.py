@@ -1,4 +1,6 @@
-"""Values and derivatives: finite, and what finite differences say; where not, which operation is to blame."""
+"""Checks of values and derivatives: finite, and equal to finite differences; if not, which operation is the cause."""
+
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -16,7 +18,7 @@ _ALL_AT_ONCE = 100
 
 
 def findings(scene: CheckedScene) -> list[Finding]:
-    if reported := _check_values(scene) or _check_finite_derivatives(scene):
+    if reported := [*_check_values(scene)] or [*_check_finite_derivatives(scene)]:
         return reported
     if scene.is_large or scene.layout.size > _ALL_AT_ONCE:
         return _compare_along_lines(scene)
@@ -27,34 +29,28 @@ def findings(scene: CheckedScene) -> list[Finding]:
 # ---- finite ----------------------------------------------------------------------------------------------------------
 
 
-def _check_values(scene: CheckedScene) -> list[Finding]:
-    m, reported = scene.measured, []
-    for role, name, value in (("lagrangian", "L", scene.lagrangian), ("forces", "The force", m.extra),
+def _check_values(scene: CheckedScene) -> Iterator[Finding]:
+    for role, name, value in (("lagrangian", "L", scene.lagrangian), ("forces", "The force", scene.measured.extra),
                               ("dissipation", "D", scene.dissipation)):  # fmt: skip
         if not np.isfinite(value).all():
             where = () if value.ndim == 0 else _select_names(scene.layout.names, ~np.isfinite(value))
             first, of = value[~np.isfinite(value)].ravel()[0], f" of {join_names(where)}" if where else ""
             message = f"{name}{of} is {first} at this state"
-            reported.append(Finding("value_not_finite", "error", where, message + _blame_phrase(scene, role, "value")))
-    return reported
+            yield Finding("value_not_finite", "error", where, message + _blame_phrase(scene, role, "value"))
 
 
-def _check_finite_derivatives(scene: CheckedScene) -> list[Finding]:
+def _check_finite_derivatives(scene: CheckedScene) -> Iterator[Finding]:
     m, n, names = scene.measured, scene.layout.size, scene.names
     first = ~np.isfinite(np.concatenate([m.by_q, m.momentum[0]]))
     drag = ~np.isfinite(m.by_v_of_dissipation)
     second = ~np.isfinite(m.mass[0]).all(axis=1) | ~np.isfinite(scene.drift) & ~drag
-    reported = []
     if first.any():
-        where = _select_names(names[:-1], first)
-        reported.append(_no_derivative(scene, "lagrangian", "The derivative of L by", where, "first"))
+        yield _no_derivative(scene, "lagrangian", "The derivative of L by", _select_names(names[:-1], first), "first")
     elif second.any():
         where = _select_names(names[n:-1], second)
-        reported.append(_no_derivative(scene, "lagrangian", "The second derivative of L by", where, "second"))
+        yield _no_derivative(scene, "lagrangian", "The second derivative of L by", where, "second")
     if drag.any():
-        where = _select_names(names[n:-1], drag)
-        reported.append(_no_derivative(scene, "dissipation", "The derivative of D by", where, "first"))
-    return reported
+        yield _no_derivative(scene, "dissipation", "The derivative of D by", _select_names(names[n:-1], drag), "first")
 
 
 def _no_derivative(scene: CheckedScene, role: str, what: str, where: tuple[str, ...], order: str) -> Finding:
@@ -83,7 +79,7 @@ _BRANCH = (
 
 
 def _blame_phrase(scene: CheckedScene, role: str, order: str) -> str:
-    """The end of a sentence: which operation, with which operands, in which line, and what to write instead."""
+    """Return the end of a sentence: the operation, its operands, its line of code, and what to write instead."""
     wanted = {"value": ("value",), "first": ("value", "first derivative")}.get(order)
     offending = [
         o for o in offenders(getattr(scene.written_motion, role), *scene.state) if not wanted or o.fault in wanted
@@ -100,8 +96,10 @@ def _blame_phrase(scene: CheckedScene, role: str, order: str) -> str:
 
 
 def _blocks(scene: CheckedScene, round_off):
-    """Blocks to compare: name, role, derivatives (directions, outputs), and which of the 2n + 1 directions and of the
-    outputs of `Measured.here` these are."""
+    """Return the derivatives to compare: (name, role, derivatives (directions, outputs), directions, outputs).
+
+    Directions index the 2n + 1 inputs (q, q̇, t), outputs index `Measured.here`.
+    """
     m, n = scene.measured, scene.layout.size
     first, dissipates = 1 + n, scene.motion.dissipation is not None
     constraint = first + dissipates
@@ -128,7 +126,7 @@ def _blocks(scene: CheckedScene, round_off):
     return [block for block in blocks if len(block[-1])]
 
 
-def _compare_derivatives(scene: CheckedScene, sides, name, role, derivative, directions, outputs) -> list[Finding]:
+def _compare_derivatives(scene: CheckedScene, sides, name, role, derivative, directions, outputs) -> Iterator[Finding]:
     m, dtype, names = scene.measured, scene.layout.dtype, scene.names
     chosen = np.ix_(directions, range(sides.plus.shape[1]), outputs)
     place = _input_magnitudes(scene)[list(directions)]
@@ -138,18 +136,17 @@ def _compare_derivatives(scene: CheckedScene, sides, name, role, derivative, dir
     )  # fmt: skip
     kinks, n = differ(ahead, behind, dtype), scene.layout.size
     derivative, wrong = derivative.value, differ(derivative, both, dtype) & ~kinks
-    names, reported = [names[i] for i in directions], []
+    names = [names[i] for i in directions]
     for i, k in list(zip(*np.nonzero(kinks), strict=True))[:_SHOWN]:
         of_velocity = name == "L" and directions[i] >= n
         values = behind.value[i, k], ahead.value[i, k], derivative[i, k]
-        reported.append(_kink_finding(scene, name, role, names[i], values, of_velocity))
+        yield _kink_finding(scene, name, role, names[i], values, of_velocity)
     for i, k in list(zip(*np.nonzero(wrong), strict=True))[:_SHOWN]:
-        reported.append(_wrong_derivative_finding(name, names[i], derivative[i, k], both.value[i, k], both.error[i, k]))
-    return reported
+        yield _wrong_derivative_finding(name, names[i], derivative[i, k], both.value[i, k], both.error[i, k])
 
 
 def _kink_finding(scene: CheckedScene, name: str, role: str, along: str, values, of_velocity: bool) -> Finding:
-    """The finding for slopes below and above the state that differ; `values` are these and the derivative."""
+    """Return the finding for different slopes below and above the state; `values` are these and the derivative."""
     below, above, derivative = values
     slope = f"The slope of {name} along {along} is {below:.6g} below this state and {above:.6g} above it"
     if role in ("lagrangian", "dissipation"):
@@ -191,7 +188,7 @@ _OF_LINES = (
 
 
 def _compare_along_lines(scene: CheckedScene) -> list[Finding]:
-    """Findings where derivatives are not the slopes along random directions of all coordinates or velocities."""
+    """Return findings where derivatives differ from slopes along random directions in q or in q̇."""
     # What is compared is a sum over all outputs of a function. A second look leaves out what the first one blames.
     n, reported = scene.layout.size, {}
     directions = np.zeros((2 * _LINES + 1, 2 * n + 1))
@@ -212,7 +209,7 @@ def _compare_along_lines(scene: CheckedScene) -> list[Finding]:
 
 
 def _blamed_coordinate(scene: CheckedScene, direction: np.ndarray, k: int) -> int | None:
-    """The place that is off by itself along a direction, by halves; None where the sum alone is off, by rounding."""
+    """Return by bisection the coordinate whose own derivative is wrong along a direction; None if there is none."""
     part = np.flatnonzero(direction)
     while len(part) > 1:
         halves = part[: len(part) // 2], part[len(part) // 2 :]
@@ -235,7 +232,7 @@ def _restrict(direction: np.ndarray, part) -> np.ndarray:
 
 
 def _off_line(scene: CheckedScene, direction: np.ndarray) -> tuple[np.ndarray, Slopes, Slopes, Slopes, np.ndarray]:
-    """Flags (2, 5) of kinks and wrong derivatives along a direction, slopes on both and on each side, derivatives."""
+    """Return flags (2, 5) of kinks and wrong derivatives along a direction; both, one-sided slopes; derivatives."""
     n, dtype = scene.layout.size, scene.layout.dtype
     steps = ladder(np.array([scene.sizes[-1] if direction[-1] else 1.0]), dtype)
     line, eps = scene.line(direction, steps[:, 0]), float(np.finfo(dtype).eps)
@@ -250,7 +247,7 @@ def _off_line(scene: CheckedScene, direction: np.ndarray) -> tuple[np.ndarray, S
 
 
 def _input_magnitudes(scene: CheckedScene) -> np.ndarray:
-    """|q|, |q̇| and the time, (2n + 1,): the numbers of the state whose rounding moves what is computed from them."""
+    """Return |q|, |q̇| and the time, (2n + 1,): magnitudes that determine the rounding error of results."""
     q, v, t = (np.abs(np.asarray(x, float)) for x in scene.state[:3])
     speed = v.max()
     return np.concatenate([q, v, [max(t, q.max() / speed if speed > 0 else 0)]])

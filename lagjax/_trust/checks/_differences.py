@@ -1,12 +1,12 @@
-"""Slopes by finite differences, with an honest estimate of their error, to compare derivatives with.
+"""Slopes by finite differences, with an estimate of their error, to verify derivatives.
 
-f is taken at x ± hₖ e for steps that halve from rung to rung, hₖ = h₀ 2⁻ᵏ. On every rung
+f is evaluated at x ± hₖ e for steps that halve from rung to rung, hₖ = h₀ 2⁻ᵏ. On every rung
 
     two-sided  (8 (f(h) − f(−h)) − (f(2h) − f(−2h))) / 12h       forward  (4 f(h) − f(2h) − 3 f(0)) / 2h
 
-and backward likewise. Large steps suffer from curvature, small ones from rounding. The error on a rung is the largest
-change between neighbouring rungs, which sees both, and never less than the rounding that f must have; the rung with the
-least error counts. Where forward and backward slopes differ by more than their errors, f has a kink.
+and backward likewise. Large steps have a truncation error, small ones a rounding error. The error on a rung is taken as
+the largest change between neighbouring rungs, but at least the rounding error of f; the rung with the least error is
+used. Where forward and backward slopes differ by more than their errors, f has a kink.
 
 Source: Press et al., *Numerical Recipes*, §5.7 (the two errors); Ridders, Adv. Eng. Softw. 4 (1982) 75.
 """
@@ -21,24 +21,24 @@ _SAFETY = 8.0
 
 
 class Slopes(NamedTuple):
-    """Estimates and their errors, each of shape (directions, outputs)."""
+    """Estimated slopes and their errors, each of shape (directions, outputs)."""
 
     value: np.ndarray
     error: np.ndarray
 
 
 def ladder(size: np.ndarray, dtype) -> np.ndarray:
-    """Steps for coordinates of these sizes, shape (rungs, coordinates): from a quarter down to eps^(2/3) of a size."""
+    """Return steps (rungs, coordinates) for coordinates of these sizes: from 1/4 down to eps^(2/3) of a size."""
     rungs = int(-np.log2(np.finfo(dtype).eps) * 2 / 3)
     return (size * 0.25 * 2.0 ** -np.arange(rungs)[:, None]).astype(dtype)
 
 
 def slopes(minus, here, plus, steps, place, eps: float, noise=0.0) -> tuple[Slopes, Slopes, Slopes]:
-    """Two-sided, forward and backward slopes from f(x − h e), f(x) and f(x + h e), each (directions, outputs).
+    """Return two-sided, forward and backward slopes from f(x − h e), f(x) and f(x + h e), each (directions, outputs).
 
     `minus` and `plus` have the shape (directions, rungs, outputs), `here` (outputs,), `steps` (rungs, directions),
-    `place` (directions,): the coordinate itself, whose rounding moves f. `noise` (outputs,): how far the rounding of
-    terms that cancel may move f beyond that of its value.
+    `place` (directions,): the coordinate itself, whose rounding changes f. `noise` (outputs,): the rounding error of f
+    from terms that cancel, beyond that of its value.
     """
     h, here = steps.T[:, 1:, None], np.asarray(here, float)
     least = float(np.finfo(steps.dtype).tiny)  # smaller numbers underflow
@@ -60,7 +60,7 @@ def slopes(minus, here, plus, steps, place, eps: float, noise=0.0) -> tuple[Slop
 
 
 def _best_estimate(estimates: np.ndarray, rounding: np.ndarray) -> Slopes:
-    """The estimate of the rung with the least error, from (directions, rungs, outputs)."""
+    """Return the estimates (directions, rungs, outputs) of the rung with the least error."""
     changes = np.abs(np.diff(estimates, axis=1))
     # The largest of the changes to two rungs on either side.
     padded = np.pad(changes, ((0, 0), (2, 2), (0, 0)), mode="edge")
@@ -73,7 +73,7 @@ def _best_estimate(estimates: np.ndarray, rounding: np.ndarray) -> Slopes:
 
 
 def _agrees_below(estimates: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """True if a rung agrees with all smaller steps, within errors: over many periods all slopes look like zero."""
+    """True if a rung agrees with all smaller steps, within errors: large steps over many periods would give 0."""
     value, reach = np.where(np.isfinite(error), estimates, 0.0), _SAFETY * error
     lowest = np.maximum.accumulate((value - reach)[:, ::-1], axis=1)[:, ::-1]
     highest = np.minimum.accumulate((value + reach)[:, ::-1], axis=1)[:, ::-1]
@@ -81,7 +81,7 @@ def _agrees_below(estimates: np.ndarray, error: np.ndarray) -> np.ndarray:
 
 
 def differ(one: Slopes, other: Slopes, dtype) -> np.ndarray:
-    """The places where two slopes differ by more than their errors and by more than eps^(1/3) of them."""
+    """True where two slopes differ by more than their errors and by more than eps^(1/3) of them."""
     allowed = _SAFETY * (one.error + other.error) + np.finfo(dtype).eps ** (1 / 3) * (abs(one.value) + abs(other.value))
     with np.errstate(invalid="ignore"):
         return np.abs(one.value - other.value) > allowed

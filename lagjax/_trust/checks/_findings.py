@@ -1,4 +1,4 @@
-"""The result of `check`: findings, each with what to change, errors first."""
+"""`Findings`, the result of `check`: each finding with what to change, errors first."""
 
 import textwrap
 from collections.abc import Iterator
@@ -48,7 +48,7 @@ class Findings:
 
     @classmethod
     def sort(cls, found: list[Finding], omitted: str = "") -> "Findings":
-        """The findings by level, those of one level in the order of `found`."""
+        """Return the findings by level, those of one level in the order of `found`."""
         return cls(tuple(sorted(found, key=lambda finding: _ORDER[finding.level])), omitted)
 
     @property

@@ -1,8 +1,8 @@
-"""Borders nearby: where a piecewise function changes its piece, and something jumps there.
+"""Search for borders nearby, where a piecewise function changes its piece and something is discontinuous.
 
-Only scenes with comparisons in them (|x|, max, where, sign, floor, ...) have borders. The search goes from the state
-along every coordinate and velocity, and along the motion, until a comparison changes its result; the border is located
-by bisection, and L, p, M and the forces are compared on both sides of it.
+Only scenes with comparisons (|x|, max, where, sign, floor, ...) have borders. From the state the search goes along
+every coordinate and velocity, and along the motion, until a comparison changes its result; the border is located by
+bisection, and L, p, M and the forces are compared on both sides of it.
 """
 
 from collections.abc import Callable
@@ -37,7 +37,7 @@ _BEYOND = 1.01  # so much more, for a border at zero that is a side by itself, a
 
 
 class Discontinuity(NamedTuple):
-    """A jump: its distance in sizes of a direction, the direction, the distance in units, the operation, what jumps."""
+    """A jump: distance in sizes of the direction, the direction, distance in its units, operation, what jumps."""
 
     sizes: float
     direction: str
@@ -61,7 +61,7 @@ def findings(scene: CheckedScene) -> list[Finding]:
 
 
 def _sides_of_states(scene: CheckedScene) -> Callable:
-    """The sides of the borders on which states (S, 2n + 1) are: by a program where the scene has one, else compiled."""
+    """Return a function of states (S, 2n + 1): on which side of each border they are. By a program, else compiled."""
     n, params = scene.layout.size, scene.state[3]
 
     def sides_at(q, v, t, params):
@@ -78,7 +78,7 @@ def _sides_of_states(scene: CheckedScene) -> Callable:
 
 
 def _search_directions(scene: CheckedScene) -> list[tuple[str, float, np.ndarray]]:
-    """(name, size, vector (2n + 1,)) of every direction: a coordinate or a velocity by its size, or the motion."""
+    """Return (name, size, vector (2n + 1,)) of each direction: coordinates, velocities, and the motion itself."""
     m, n = scene.measured, scene.layout.size
     axes = np.diag(scene.sizes)
     axes[-1, :n], axes[-1, n:-1] = scene.sizes[-1] * m.velocity[0], scene.sizes[-1] * scene.solve_saddle()[0]
@@ -86,7 +86,7 @@ def _search_directions(scene: CheckedScene) -> list[tuple[str, float, np.ndarray
 
 
 def _first_jump(scene: CheckedScene, sides: Callable, start, vector, axis, labels: list[str]) -> Discontinuity | None:
-    """The nearest border along `vector`, if something jumps there."""
+    """Return the nearest border along `vector` if a function is discontinuous there, else None."""
     eps, vector = float(np.finfo(start.dtype).eps), np.asarray(vector, start.dtype)
 
     def displaced_states(steps):

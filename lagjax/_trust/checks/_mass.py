@@ -1,7 +1,8 @@
-"""The mass matrix: velocities that carry no kinetic energy, and why; its signs and its condition.
+"""Checks of the mass matrix: velocities that carry no kinetic energy, and why; its signs and its condition.
 
-With constraints it may be singular where they hold what L does not. Then the augmented matrix K = M + GᵀW G is
-examined, which is regular when the saddle point is (`_linear`). States nearby tell what a direction u with K u = 0 is:
+With constraints M may be singular along directions that they exclude. Then the augmented matrix K = M + GᵀW G is
+examined, which is regular when the saddle point is (`_linear`). A direction u with K u = 0 is classified by K at states
+nearby:
 
     the row of M is zero everywhere, and p too             a velocity that L does not contain
     the row of M is zero everywhere, p is not              L is linear in it
@@ -43,14 +44,14 @@ def findings(scene: CheckedScene) -> list[Finding]:
 
 
 def null_velocities(matrix: np.ndarray) -> np.ndarray:
-    """Unit vectors (k, n), one a row, along which a symmetric matrix is zero up to the rounding of its entries."""
+    """Return unit vectors (k, n), one a row, that span the null space of a symmetric matrix, up to rounding."""
     # The entries are derivatives with some units of round-off each: more is allowed for here than in `_linear`, where a
     # matrix is solved with that is taken to be exact.
     return null_directions(matrix, _rounding_fraction(matrix))
 
 
 def _rounding_fraction(matrix: np.ndarray) -> float:
-    """The largest eigenvalue that rounding makes of a zero, as a fraction of the largest: 32 units for each row."""
+    """Return the largest ratio to the largest eigenvalue that counts as zero: 32 round-offs per row."""
     return 32 * singular_threshold(len(matrix), matrix.dtype)
 
 
@@ -63,7 +64,7 @@ _NO_ENERGY = (
 
 
 def _check_singular(scene: CheckedScene, augmented: np.ndarray, usable: list[int]) -> list[Finding]:
-    """Findings for K (states, n, n) that is singular at the state; `usable` are the states nearby where K is finite."""
+    """Return findings for K (states, n, n), singular at the state; K is finite at the `usable` states nearby."""
     names, constrained = scene.layout.names, scene.motion.constrained
     empty = [i for i in range(len(names)) if all(not augmented[k][i].any() for k in [0, *usable])]
     momenta = scene.measured.momentum[[0, *usable]]
@@ -83,7 +84,7 @@ def _check_singular(scene: CheckedScene, augmented: np.ndarray, usable: list[int
 
 
 def _massless_finding(where: tuple[str, ...], linear: bool, constrained: bool) -> Finding:
-    """The finding for coordinates of which M has zero rows, and whether L is linear in their velocities."""
+    """Return the finding for coordinates with zero rows of M; `linear`: L is linear in their velocities."""
     kind, name = "linear_in_velocity" if linear else "velocity_unused", join_names(where)
     velocity = join_names([f"d{name}" for name in where])
     what = f"L is linear in {velocity}" if linear else f"L does not contain the velocity {velocity}"
@@ -97,7 +98,7 @@ def _massless_finding(where: tuple[str, ...], linear: bool, constrained: bool) -
 
 
 def _classify_singularity(scene: CheckedScene, here: np.ndarray, nearby: dict[int, np.ndarray]) -> tuple[str, str]:
-    """The kind of a singularity with these null directions, and the rest of the sentence about it."""
+    """Return (kind, end of the message) of a singularity with null directions `here` and `nearby`."""
     m = scene.measured
     if any(not len(directions) for k, directions in nearby.items() if not (m.velocity[k] != m.velocity[0]).any()):
         return "coordinate_singularity", (
@@ -142,7 +143,7 @@ def _span_same_space(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def describe_direction(direction: np.ndarray, names: Sequence[str]) -> str:
-    """A direction as +1 dq[0] -0.3 dq[1]."""
+    """Return a direction as text, such as "+1 dq[0] -0.3 dq[1]"."""
     direction = direction / direction[np.argmax(np.abs(direction))]
     terms = [f"{c:+.3g} d{name}" for c, name in zip(direction, names, strict=True) if abs(c) > 1e-6]
     return " ".join(terms[:8]) + (" …" if len(terms) > 8 else "")
@@ -156,7 +157,7 @@ _NEARLY = 1e-6
 
 
 def _check_nearly_singular(here: np.ndarray, others: list[np.ndarray], names) -> list[Finding]:
-    """A warning next to a pole, where K is regular in its own scale but nearly singular in that of states nearby."""
+    """Return a warning near a pole: K is regular, but nearly singular when scaled by the diagonal at other states."""
     if not others:
         return []
     usual = 1 / np.sqrt(np.maximum(np.median([np.abs(np.diagonal(k)) for k in others], axis=0), 1e-300))
@@ -180,7 +181,7 @@ def _check_nearly_singular(here: np.ndarray, others: list[np.ndarray], names) ->
 
 
 def _check_signs(mass: np.ndarray, rows: np.ndarray, names) -> list[Finding]:
-    """Negative kinetic energy along velocities that the constraints allow."""
+    """Return a finding if the kinetic energy is negative along velocities that the constraints allow."""
     scaled, scale = unit_diagonal(mass)
     free = null_space(rows * scale)
     if not free.shape[1]:
@@ -227,7 +228,7 @@ def _ill_conditioned(condition: float, more: str, direction: np.ndarray, names, 
 
 
 def _large_findings(scene: CheckedScene, names) -> list[Finding]:
-    """Findings about M, regular also where constraints hold, from its entries where their places are known."""
+    """Return findings about M of a large scene, also with constraints, from its entries if they are known."""
     m = scene.measured
     empty = np.isfinite(m.mass[0]).all() and ~m.mass.any(axis=(0, 2))
     if np.any(empty):

@@ -1,4 +1,4 @@
-"""Everything that `check` computes: the values and derivatives of a scene at a state and at states around it.
+"""`CheckedScene`: the values and derivatives of a scene at a state and around it, from which `check` finds its results.
 
 A `Sample` evaluates the scene: by its programs in NumPy, which compiles nothing, or else compiled by XLA.
 """
@@ -21,7 +21,7 @@ _NEARBY = 4  # states with different positions, and as many with different veloc
 
 
 class CheckedScene(NamedTuple):
-    """A scene at a state, and what was measured there. Everything is flat; n coordinates, m constraints."""
+    """A scene at a state, and the quantities evaluated there. All arrays are flat: n coordinates, m constraints."""
 
     system: System
     layout: Layout
@@ -53,7 +53,7 @@ class CheckedScene(NamedTuple):
 
     @property
     def written_motion(self) -> Motion:
-        """The motion by the functions of this very system: a derivation serves all systems of one text."""
+        """The equations with the functions of this very system; `derivation` may be of another with the same text."""
         return self.system._motion(self.layout, self.arguments[3])
 
     @property
@@ -63,7 +63,7 @@ class CheckedScene(NamedTuple):
         return (*names, *(f"d{name}" for name in names), "the motion")
 
     def sides(self) -> "Sides":
-        """The outputs on both sides of the state, along every coordinate and velocity and along the motion."""
+        """Return the outputs on both sides of the state, along every coordinate, velocity and the motion."""
         minus, plus = self.displaced_outputs()
         one, here = self.sample, self.measured
         drift = {
@@ -84,7 +84,7 @@ class CheckedScene(NamedTuple):
         return Sides(minus, plus, noise, round_off)
 
     def displaced_outputs(self) -> tuple[np.ndarray, np.ndarray]:
-        """The outputs of `Measured.here` at steps back and ahead, (2n + 1, rungs, outputs) each."""
+        """Return the outputs of `Measured.here` at steps back and ahead, (2n + 1, rungs, outputs) each."""
         here, n, steps = self.point, self.layout.size, self.steps
         axes = np.eye(2 * n + 1, dtype=here.dtype)
         axes[-1, :n] = here[n:-1]
@@ -99,17 +99,17 @@ class CheckedScene(NamedTuple):
         return np.concatenate([np.ravel(x) for x in self.state[:3]])
 
     def sample_at(self, points: np.ndarray) -> Sample:
-        """The scene at S other points (q, q̇, t), (S, 2n + 1)."""
+        """Return a `Sample` at S other points (q, q̇, t), (S, 2n + 1)."""
         n = self.layout.size
         return self.sample._replace(q=points[:, :n], qdot=points[:, n:-1], t=points[:, -1])
 
     @property
     def is_large(self) -> bool:
-        """True if M and G are known by products alone: `Measured` holds those with one vector, (…, 1)."""
+        """True if M and G are known only by products: `Measured` has their products with one vector, (…, 1)."""
         return self.derivation.form.is_sparse
 
     def line(self, direction: np.ndarray, steps: np.ndarray) -> "LineValues":
-        """The scene along a `direction` (2n + 1,) of the coordinates, the velocities and the time of the motion."""
+        """Evaluate the scene along a `direction` (2n + 1,) of the coordinates, the velocities and the motion."""
         n, m, here = self.layout.size, self.measured, self.point
         moved = direction + direction[-1] * np.concatenate([here[n:-1], np.zeros(n + 1)])
         q, qdot, t, params = self.arguments
@@ -145,7 +145,7 @@ class CheckedScene(NamedTuple):
         return augment(self.measured.mass, self.measured.jacobian)[0]
 
     def solve_saddle(self) -> tuple[np.ndarray, np.ndarray]:
-        """q̈ (n,) and λ (m,) at the state; of a large scene q̈ alone."""
+        """Return q̈ (n,) and λ (m,) at the state; of a large scene λ is empty."""
         m, n = self.measured, self.layout.size
         if m.acceleration is not None:
             return m.acceleration, np.zeros(0)
@@ -153,7 +153,7 @@ class CheckedScene(NamedTuple):
         return x[:n], x[n:]
 
     def jacobian(self) -> np.ndarray:
-        """∂q̈/∂(q, q̇) at the state, (n, 2n): by the implicit function theorem and programs, or compiled by XLA."""
+        """Return ∂q̈/∂(q, q̇) at the state, (n, 2n), by the implicit function theorem; without programs, by JAX."""
         try:
             varied = _program_variation(self.derivation, self.state, *self.solve_saddle())
         except Unlowerable:
@@ -161,13 +161,13 @@ class CheckedScene(NamedTuple):
         return self._solve_saddle(-varied)[: self.layout.size]
 
     def _solve_saddle(self, b: np.ndarray) -> np.ndarray:
-        """(q̈, λ) of the saddle point M q̈ − Gᵀλ = b₁, G q̈ = b₂ for columns b (n + m, k); NaN where it is singular."""
+        """Solve M q̈ − Gᵀλ = b₁, G q̈ = b₂ for columns b (n + m, k): (q̈, λ), NaN if singular."""
         above, below = np.split(b[None], [self.layout.size], axis=1)
         return np.concatenate(saddle_many(self.measured.mass[:1], above, self.measured.jacobian[:1], below), axis=1)[0]
 
 
 class Measured(NamedTuple):
-    """The measurements. A first axis of states stands for the state itself, then others in q, then others in q̇."""
+    """Quantities at the state and nearby. A first axis of states has the state, then others in q, then in q̇."""
 
     by_q: Any  # ∂L/∂q, (n,)
     force: Any  # F = M q̈ − Gᵀλ, (n,)
@@ -184,7 +184,7 @@ class Measured(NamedTuple):
 
 
 class LineValues(NamedTuple):
-    """L, p, D, f and a along a line through the state, a weighted sum of each, (5,)."""
+    """Weighted sums of each of L, p, D, f and a, (5,), along a line through the state."""
 
     here: Any
     terms: Any  # the sum of the sizes of what they consist of
@@ -194,7 +194,7 @@ class LineValues(NamedTuple):
 
 
 class Sides(NamedTuple):
-    """The references of derivatives: the outputs of `Measured.here` at states on both sides, and rounding."""
+    """Outputs of `Measured.here` on both sides of the state, for finite differences, and their rounding errors."""
 
     minus: Any  # at steps back, (directions, rungs, outputs)
     plus: Any  # at steps ahead, (directions, rungs, outputs)
@@ -203,7 +203,7 @@ class Sides(NamedTuple):
 
 
 def _state_scales(here: Sample) -> Scales:
-    """The sizes of coordinates, velocities and the time at a state; one, where the scene does not tell."""
+    """Return the scales of coordinates, velocities and time at a state; 1 where the scene determines none."""
     q, v, t = (np.asarray(x, np.float64) for x in (here.q[0], here.qdot[0], here.t))
 
     def evaluated(name, q, v):
@@ -217,11 +217,11 @@ def _state_scales(here: Sample) -> Scales:
 
 
 def _input_sizes(q: PyTree, qdot: PyTree, scales: Scales) -> np.ndarray:
-    """The size of every coordinate, of every velocity, and of the time along the motion, (2n + 1,).
+    """Return the size of every coordinate, of every velocity, and of the time along the motion, (2n + 1,).
 
-    A coordinate has its absolute value as its size; where that is zero, the largest in its array, or its scale. One
-    that is tiny beside the others (an angle that was projected to 1e-20) counts as a thousandth of that scale. The size
-    of the time is what the fastest coordinate takes to move by its size, or its scale if that is shorter.
+    The size of a coordinate is its absolute value; if that is zero, the largest in its array, or its scale. One that is
+    tiny beside the others (an angle that was projected to 1e-20) counts as a thousandth of that scale. The size of the
+    time is the time in which the fastest coordinate moves by its size, or its scale if that is shorter.
     """
 
     def sizes_of(tree, scale):
@@ -237,7 +237,7 @@ def _input_sizes(q: PyTree, qdot: PyTree, scales: Scales) -> np.ndarray:
 
 
 def _nearby_offsets(sizes: np.ndarray, scales: Scales, dtype) -> np.ndarray:
-    """Offsets (1 + 2 · _NEARBY, 2n) from the state: zero, then random ones of q alone, then of q̇ alone."""
+    """Return offsets (1 + 2 · _NEARBY, 2n) from the state: zero, then random ones in q alone, then in q̇ alone."""
     # Their deviation is a tenth of the sizes. A coordinate that is small beside the others moves by a tenth of its
     # scale: it may be next to where the chart is singular, and has to leave that.
     n = len(scales.q)
@@ -256,7 +256,7 @@ _DERIVED = ("lagrangian_by_q", "momentum", "mass_matrix", "given_force", "dissip
 
 
 def _measure_states(here: Sample, offsets: np.ndarray) -> Measured:
-    """The measurements at the state and at `offsets` (states, 2n) from it."""
+    """Evaluate the quantities at the state and at `offsets` (states, 2n) from it."""
     n = here.derivation.layout.size
     velocity = here.qdot + offsets[:, n:]
     near = here._replace(q=here.q + offsets[:, :n], qdot=velocity)
@@ -300,7 +300,7 @@ def _evaluate_line(system: System, q, qdot, t, params, direction, steps):
 
 
 def _program_variation(derivation: Derivation, state, acceleration, multipliers) -> np.ndarray:
-    """The slopes of M q̈ − Gᵀλ − F and G q̈ − γ by (q, q̇), (n + m, 2n), for constant q̈ and λ: by the programs."""
+    """Return ∂(M q̈ − Gᵀλ − F, G q̈ − γ)/∂(q, q̇), (n + m, 2n), at constant q̈ and λ, by scalar programs."""
     # It is one transposed derivative of the program of M, F, G and γ, for all n + m equations side by side.
     q, v, t, numbers = *map(np.asarray, state[:3]), numbers_of(state[3])
     n, m = len(q), len(multipliers)
@@ -320,14 +320,14 @@ def _program_variation(derivation: Derivation, state, acceleration, multipliers)
 
 
 def _rounding(*terms):
-    """The rounding of derivatives, in the shape of the first of `terms`: four units of the sum of the largest terms."""
+    """Return the rounding error of derivatives, like `terms[0]`: four round-offs of the sum of the largest terms."""
     size = sum(np.max(np.abs(term), initial=0.0) for term in terms)
     return np.full(terms[0].shape, 4 * np.finfo(terms[0].dtype).eps * size)
 
 
 @eqx.filter_jit
 def _acceleration_slopes(system: System, q, qdot, t, params):
-    """∂q̈/∂q and ∂q̈/∂q̇, (n, n) each."""
+    """Return ∂q̈/∂q and ∂q̈/∂q̇, (n, n) each."""
     layout, numbers = Layout.from_state(q, qdot), eqx.filter(params, eqx.is_array_like)
     state = layout.flatten(q), layout.flatten(qdot), t, numbers
     return jax.jacfwd(system._motion(layout, params).acceleration, argnums=(0, 1))(*state)

@@ -1,4 +1,4 @@
-"""Time scales: the eigenvalues of the motion linearised at the state."""
+"""Check of stiffness: the eigenvalues of the motion linearised at the state."""
 
 import numpy as np
 
@@ -39,7 +39,7 @@ def findings(scene: CheckedScene) -> list[Finding]:
 
 
 def _trusted_eigenvalues(linear: np.ndarray, eps: float) -> np.ndarray:
-    """The eigenvalues of ẏ = A y, but zero, that noise of the size of rounding moves by less than a tenth."""
+    """Return the nonzero eigenvalues of ẏ = A y that noise of the size of rounding changes by less than 10 %."""
     # A defective zero, as of a free coordinate, is not one of them: rounding makes eigenvalues of √eps of it.
     speed = np.sqrt(np.abs(linear[len(linear) // 2 :]).max()) or 1.0
     scale = np.repeat([1.0, speed], len(linear) // 2)  # the time in units in which both halves are alike

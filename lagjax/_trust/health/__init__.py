@@ -1,9 +1,9 @@
-"""`Health`: how far a trajectory can be trusted, measured on the trajectory itself.
+"""`Health`: the accuracy of a trajectory, measured on the trajectory itself.
 
-A motion has laws that the numbers must obey whatever integrated them. At every output are evaluated
+A motion satisfies laws, whatever solver integrated it. At every output are evaluated
 
     h − h₀ − ∫ P dt      with the power P = −∂L/∂t + Q·q̇ + λ·(G q̇), zero where nothing drives or slows the motion
-    pᵢ − pᵢ₀             where neither L nor any force knows qᵢ
+    pᵢ − pᵢ₀             where neither L nor any force depends on qᵢ
     f, G q̇ + ∂f/∂t       of the constraints
     M                    its eigenvalues
     ∂(M, F, G)           by the state, the time and every parameter: whether it is finite
@@ -16,12 +16,12 @@ of the state y = (q, q̇), and in a conserved quantity c such errors add up: aft
 times √(2n) `SLACK` for solvers that measure errors in root mean square, and round-off. Other errors, those of q above
 all, may grow with the motion: there is no bound for them, only a second trajectory to compare with.
 
-Between outputs the power is integrated along polynomials (`_measurements`). Where the balance is off by more than a
-hundredth of the energy, and the work may be, the verdict says that it cannot be told. Source: Hairer, Nørsett & Wanner,
-*Solving Ordinary Differential Equations I*, §II.4 (error per step), §II.6 (Hermite interpolation).
+Between outputs the power is integrated along polynomials (`_measurements`). If the balance is off by more than a
+hundredth of the energy, and the error of the work is as large, it counts as undecided. Source: Hairer, Nørsett &
+Wanner, *Solving Ordinary Differential Equations I*, §II.4 (error per step), §II.6 (Hermite interpolation).
 
-`_measurements` goes from states to the arrays of a report, by the laws of `_laws`; `_border_counts` counts the borders
-that were met, `_global_error` compares with a second trajectory.
+`_measurements` computes the fields of `Health` from states, by the laws of `_laws`; `_border_counts` counts the borders
+that a motion crossed, `_global_error` compares with a second trajectory.
 """
 
 import textwrap
@@ -37,7 +37,7 @@ from lagjax._interface import RESULTS, Layout, advice, is_concrete, name_of, sho
 from lagjax._run import Members
 from lagjax._scene import System
 from lagjax._trust._diagnosis import diagnosis, motion_end
-from lagjax._trust.health._border_counts import Met, count_borders, is_piecewise
+from lagjax._trust.health._border_counts import BorderCounts, count_borders, is_piecewise
 from lagjax._trust.health._global_error import global_error
 from lagjax._trust.health._measurements import SLACK, SMALLEST, VISIBLE, Extreme, does_work, measure_trajectory
 
@@ -46,7 +46,7 @@ UNSTEADY = 0.5
 
 
 def examine(trajectory, reference=None) -> "Health":
-    """The `Health` of a trajectory, with its global error if there is a reference; see `Trajectory.health`."""
+    """Return the `Health` of a trajectory, with its global error if there is a reference; see `Trajectory.health`."""
     fields = measure_trajectory(trajectory)
     impacts = doubts = None
     if trajectory.impacts is not None:  # impacts and friction take energy: no balance of it is at hand
@@ -76,7 +76,7 @@ def examine(trajectory, reference=None) -> "Health":
 
 
 def _first_diagnosis(trajectory) -> str:
-    """The obstacle of the first member that failed; nothing where none did, or where that is being traced."""
+    """Return the diagnosis of the first member that failed; "" if none did, or inside a transformation."""
     concrete = all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory))
     if not isinstance(trajectory.system, System) or not concrete:
         return ""
@@ -91,7 +91,7 @@ def _first_diagnosis(trajectory) -> str:
 
 
 def _shared_impacts(trajectory) -> tuple:
-    """The number of impacts that several contacts took part in, and the time of the first one."""
+    """Return the number of impacts that several contacts took part in, and the time of the first one."""
     t, leaves = trajectory.impacts.t, jax.tree.leaves(trajectory.impacts.impulse)
     pushes = jnp.concatenate([jnp.reshape(x, (*t.shape, -1)) > 0 for x in leaves], axis=-1)
     shared = jnp.sum(pushes, axis=-1) > 1
@@ -100,12 +100,12 @@ def _shared_impacts(trajectory) -> tuple:
     return jnp.sum(shared, axis=-1), jnp.nanmin(jnp.where(shared, t, jnp.nan), axis=-1)
 
 
-def _borders(trajectory) -> tuple[bool, Met | None]:
-    """`count_borders` with the batch axes of the trajectory; None for a piecewise scene where something is traced."""
+def _borders(trajectory) -> tuple[bool, BorderCounts | None]:
+    """Return `count_borders` with the batch axes of the trajectory; None for a piecewise scene that is traced."""
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
         members = Members(trajectory)
         located, counts = count_borders(members)
-        return located, counts and Met(*(jnp.asarray(np.reshape(x, members.batch)) for x in counts))
+        return located, counts and BorderCounts(*(jnp.asarray(np.reshape(x, members.batch)) for x in counts))
     system, piecewise = trajectory.system, []
     if not isinstance(system, System):
         return True, None
@@ -117,7 +117,7 @@ def _borders(trajectory) -> tuple[bool, Met | None]:
 
     zero = trajectory.map_members(none)
     located = trajectory.engine == "MachineCode" or not piecewise[0]
-    return located, None if piecewise[0] else Met(zero, zero, zero, jnp.full(zero.shape, jnp.nan))
+    return located, None if piecewise[0] else BorderCounts(zero, zero, zero, jnp.full(zero.shape, jnp.nan))
 
 
 class Health(eqx.Module):
@@ -190,7 +190,7 @@ class Health(eqx.Module):
     gradients_finite: Bool[Array, "*batch"]
     gradients_time: Float[Array, "*batch"]
     global_error: Extreme | None
-    borders: Met | None
+    borders: BorderCounts | None
     guards: tuple[Bool[Array, "*batch"], Bool[Array, "*batch"]] | None
     impacts: tuple[Int[Array, "*batch"], Float[Array, "*batch"], Int[Array, "*batch"], Float[Array, "*batch"]] | None
     doubts: tuple[Int[Array, "*batch 3"], Float[Array, "*batch 3"]] | None
@@ -213,11 +213,11 @@ class Health(eqx.Module):
 
     @property
     def _energy_limit(self):
-        """The imbalance of energy beyond which it is suspicious: what is allowed, and what the outputs leave open."""
+        """The imbalance of energy above which it is suspicious: the drift allowed, plus the error of the work."""
         return self.energy_allowed + SLACK * self.work_error
 
     def _health_flags(self) -> tuple[dict, Any]:
-        """`checks`, and the library they are computed in: NumPy where nothing is being traced."""
+        """Return `checks`, and the library of its arrays: NumPy unless something is traced."""
         concrete = all(is_concrete(leaf) for leaf in jax.tree.leaves(self))
         xp = np if concrete else jnp
         of = jax.tree.map(np.asarray, self) if concrete else self
@@ -274,7 +274,7 @@ class Health(eqx.Module):
         return (*sentences.values(), *self._explain_undecided())
 
     def _explain_undecided(self) -> tuple[str, ...]:
-        """A sentence where the outputs are too few to tell whether the power is balanced."""
+        """Return a sentence if there are too few outputs to decide whether the power is balanced; else ()."""
         outputs, needed = np.asarray(self.outputs), np.asarray(self.outputs_needed)
         undecided = needed > outputs
         if not undecided.any():
@@ -334,7 +334,7 @@ class Health(eqx.Module):
         return "\n".join(f"{name:17s} {text}" for name, text in rows)
 
     def _border_contacts(self) -> str:
-        """A row of the report about the borders that the motion crossed, slid along or grazed; empty if it met none."""
+        """Return the report's row on borders that the motion crossed, slid along or grazed; "" if none."""
         if self.borders is None:
             return "" if self.borders_located else "not located"
         crossed, slid, grazed = (np.asarray(x) for x in self.borders[:3])
@@ -364,7 +364,7 @@ def _exceeds_limit(xp, extreme: Extreme, allowed):
 
 
 def _find_worst(extreme: Extreme, allowed=None, sign: int = 1) -> str:
-    """The largest value of all members, where and when; `sign` undoes a change of sign made to rank them."""
+    """Return the largest value of all members as text, where and when; `sign` is the sign of the values printed."""
     values, times = np.asarray(extreme.value, float), np.asarray(extreme.t, float)
     if np.isnan(times).all():
         return "nan: no output was reached"
@@ -376,7 +376,7 @@ def _find_worst(extreme: Extreme, allowed=None, sign: int = 1) -> str:
 
 
 def _worst_row(label: str, names: tuple[str, ...], extreme: Extreme, allowed) -> list[tuple[str, str]]:
-    """A row of the report for the one of several named quantities whose value is largest relative to its limit."""
+    """Return the report's row for the one of several named quantities that is largest relative to its limit."""
     if not names:
         return []
     allowed = np.asarray(allowed)

@@ -1,7 +1,7 @@
-"""The borders that a motion met (`_program._borders`), from its steps taken once more.
+"""Counts of the borders that a motion crossed, slid along or grazed (`_program._borders`).
 
-What a step ends at is written down for derivatives, and for them alone. So the motion is followed again as for one,
-over the time that it took. That costs as much as the motion did; scenes without borders pay nothing.
+Crossings are recorded only when a run is prepared for derivatives. So the motion is integrated again in this way, over
+the time that it took. That costs as much as the motion did; scenes without borders pay nothing.
 """
 
 from typing import Any, NamedTuple
@@ -21,8 +21,8 @@ from lagjax._trust.health._measurements import path_of
 LARGEST_COUNTED = 2**22  # numbers of steps that are written down at once
 
 
-class Met(NamedTuple):
-    """The number of times each of N members crossed a border, began to slide along one, and grazed one; (N,) each."""
+class BorderCounts(NamedTuple):
+    """Counts, (N,) each, of how often a member crossed a border, began to slide along one, and grazed one."""
 
     crossed: Any
     slid: Any
@@ -30,13 +30,13 @@ class Met(NamedTuple):
     t: Any  # when it first grazed one, NaN where it did not
 
 
-def count_borders(members: Members) -> tuple[bool, Met | None]:
-    """A flag that steps ended at the borders of the scene; and how the motion met them; None where not known."""
+def count_borders(members: Members) -> tuple[bool, BorderCounts | None]:
+    """Return whether steps ended at the borders of the scene, and the counts `BorderCounts`; None if not known."""
     trajectory = members.trajectory
     if not isinstance(trajectory.system, System):  # modes have transitions for that
         return True, None
     crossed, slid, grazed = (np.zeros(members.count, int) for _ in range(3))
-    nothing = Met(crossed, slid, grazed, np.full(members.count, np.nan))
+    nothing = BorderCounts(crossed, slid, grazed, np.full(members.count, np.nan))
     if not is_piecewise(trajectory.system, members.layout, members.params):
         return True, nothing
     if trajectory.engine != "MachineCode" or trajectory.tolerances is None:
@@ -60,7 +60,7 @@ def count_borders(members: Members) -> tuple[bool, Met | None]:
 
 
 def is_piecewise(system: System, layout: Layout, params) -> bool:
-    """True if the accelerations of a scene decide on something along a motion."""
+    """True if the accelerations of a scene depend on comparisons whose result may change along a motion."""
     derivation = derivation_of(system, layout, params)
     try:
         return derivation.borders is not None and bool(derivation.borders.switches)
@@ -68,8 +68,8 @@ def is_piecewise(system: System, layout: Layout, params) -> bool:
         return bool(pieces_of_motion(derivation.motion, *derivation.state_shapes))
 
 
-def _count_contacts(flow: Flow, ts, y0, params, tolerances: Tolerances, steps, places, into: Met) -> None:
-    """Follow some motions, and add what they met `into` the counts at their places."""
+def _count_contacts(flow: Flow, ts, y0, params, tolerances: Tolerances, steps, places, into: BorderCounts) -> None:
+    """Integrate some motions, and add their counts to `into` at their `places`, in place."""
     borders = flow.kernel.borders
     assert borders is not None  # without a series there are none, and none are counted
     guards, pieces = borders.guards, len(borders.switches)

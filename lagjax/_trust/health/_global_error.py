@@ -1,4 +1,4 @@
-"""The error of a whole motion, by a second trajectory with a tighter tolerance."""
+"""The error of a whole motion, by comparison with a second trajectory of tighter tolerance."""
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ _FLOOR = 1e-3  # atol/rtol for fixed steps, which have no tolerances: the defaul
 
 
 def global_error(trajectory, reference) -> Extreme:
-    """The largest |yᵢ − reference| over the size of yᵢ along the path, (…), at the outputs that both have reached."""
+    """Return the largest |yᵢ − reference| relative to the size of yᵢ along the path, (…), over common outputs."""
     require_comparable(trajectory, reference)
     floor = _FLOOR
     if trajectory.tolerances is not None:
@@ -26,7 +26,7 @@ def global_error(trajectory, reference) -> Extreme:
 
 
 def require_comparable(trajectory, reference) -> None:
-    """Raise where two trajectories cannot be compared, or where the second cannot judge the first."""
+    """Raise if two trajectories cannot be compared, or if the reference is not more accurate."""
     if not isinstance(reference, type(trajectory)):
         raise TypeError(f"reference must be a Trajectory; got {type(reference).__name__}.")
     for name in ("q", "qdot", "ts"):
@@ -52,7 +52,7 @@ def require_comparable(trajectory, reference) -> None:
 
 
 def _arrays_agree(ours, theirs, eps: float) -> bool:
-    """True if two arrays agree to 4 eps; values that are being traced cannot be compared, and count as equal."""
+    """True if two arrays agree to 4 eps; also if one is traced."""
     if not (is_concrete(ours) and is_concrete(theirs)):
         return True
     ours, theirs = np.asarray(ours), np.asarray(theirs)
@@ -60,7 +60,7 @@ def _arrays_agree(ours, theirs, eps: float) -> bool:
 
 
 def _output_states(trajectory) -> jax.Array:
-    """The states (q, q̇) at all outputs, (..., T, 2n)."""
+    """Return the states (q, q̇) at all outputs, (..., T, 2n)."""
     axes = jnp.ndim(trajectory.ok) + 1
     leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves((trajectory.q, trajectory.qdot))]
     return jnp.concatenate([leaf.reshape(*leaf.shape[:axes], -1) for leaf in leaves], axis=-1)

@@ -1,8 +1,8 @@
-"""The measurements at the states of a motion whose laws are known.
+"""`Law`: evaluates the quantities of `Health` at states, with the equations of motion of one mode.
 
 `Law.measurements` takes a `Sample` of many states, which programs evaluate in NumPy without compiling anything;
-`Law.measurements_at` takes one state in JAX: for values that are being traced, and for scenes without programs. Both
-give the quantities of the scene to `_measure_path`, which holds the laws, for arrays of either library.
+`Law.measurements_at` takes one state in JAX, for traced values and for scenes without programs. Both pass the
+quantities of the scene to `_measure_path`, which is written for arrays of either library.
 """
 
 from functools import partial
@@ -36,7 +36,7 @@ _DERIVATIVE_BUDGET = 20_000  # operations of the program that computes a doubtfu
 
 
 class Measurements(NamedTuple):
-    """The measurements at one state; at S states every field has a first axis (S, …)."""
+    """The quantities of `Health` at one state; at S states every field has a first axis (S, …)."""
 
     conserved: Any  # c: h, then k − 1 momenta, (k,)
     slopes: Any  # Σ |∂c/∂yᵢ| (rtol|yᵢ| + atol), the error that one step may put into c, (k,)
@@ -50,7 +50,7 @@ class Measurements(NamedTuple):
 
 
 class Law(NamedTuple):
-    """The equations of one mode, and which of its quantities are constant."""
+    """The equations of motion of one mode, and which of its quantities are conserved."""
 
     derivation: Derivation
     works: bool  # whether anything does work, so that h is not constant
@@ -63,12 +63,12 @@ class Law(NamedTuple):
 
     @property
     def knows_mass(self) -> bool:
-        """True if the eigenvalues of M are known: not of a large scene, unless M is diagonal."""
+        """True if the eigenvalues of M are computed: not for a large scene, unless M is diagonal."""
         return not self.derivation.form.is_sparse or isinstance(self.derivation.form.mass, Diagonal)
 
     @classmethod
     def from_system(cls, system: System, layout: Layout, params, mode: str) -> "Law":
-        """The law of a system; `mode`, where it is not empty, is a prefix of the names of constraints."""
+        """Return the law of a system; `mode`, if not empty, is a prefix of the names of constraints."""
         derivation = derivation_of(system, layout, params)
         names = system.constraint_names(layout, params) if derivation.motion.constrained else []
         works, conserved = (True, ()) if system.touches else _conservation_flags(system, derivation)
@@ -77,7 +77,7 @@ class Law(NamedTuple):
     # ---- many states, by programs ----
 
     def measurements(self, momenta: tuple[int, ...], tolerances, sample: Sample) -> Measurements:
-        """The `Measurements` at S states; `tolerances` are rtol and atol, () or (S,) each."""
+        """Return the `Measurements` at S states; `tolerances` are rtol and atol, () or (S,) each."""
 
         def measure_part(part: Sample, *tolerances) -> Measurements:
             of, by_q = part.quantities(*_QUANTITIES), part.momenta_by_q(momenta)
@@ -87,21 +87,21 @@ class Law(NamedTuple):
         return sample.evaluate_in_parts(measure_part, self._portion(_QUANTITIES), *tolerances)
 
     def powers(self, sample: Sample) -> np.ndarray:
-        """dh/dt at S states, shape (S,)."""
+        """Return dh/dt at S states, (S,)."""
         names = (*_SOURCES, *(SADDLE if self.motion.constrained else ()))
         return sample.evaluate_in_parts(
             lambda part: self._energy_power(part.quantities(*names), part.qdot), self._portion(_QUANTITIES)
         )
 
     def accelerations(self, sample: Sample) -> np.ndarray:
-        """q̈ at S states, shape (S, n)."""
+        """Return q̈ at S states, (S, n)."""
         return sample.evaluate_in_parts(lambda part: solve_saddle(part.quantities(*SADDLE))[0], self._portion(SADDLE))
 
     def _portion(self, names: tuple[str, ...]) -> int:
         return max(1, _CHUNK // sum(self.derivation.count(name) for name in names))
 
     def _derivatives_finite(self, sample: Sample) -> np.ndarray:
-        """True if M, F, G and γ have finite derivatives by all inputs at S states, (S,)."""
+        """Return (S,): True if M, F, G and γ have finite derivatives with respect to all inputs."""
         # One transposed derivative of the sum of them all is taken, which a single NaN makes NaN. The program's own
         # operations answer first. Where they say no, the program may have written a power as a root, or the user may
         # have given a rule for a derivative: there the derivative of the functions themselves decides.
@@ -128,7 +128,7 @@ class Law(NamedTuple):
     # ---- one state, in JAX ----
 
     def measurements_at(self, momenta: tuple[int, ...], tolerances, q, qdot, t, params) -> Measurements:
-        """The `Measurements` at one state, with the momenta of the coordinates in `momenta`."""
+        """Return the `Measurements` at one state, with the momenta of the coordinates in `momenta`."""
         motion, state, chosen = self.motion, (q, qdot, t, params), jnp.asarray(momenta, int)
         by_q = jax.jacrev(lambda *state: motion.momentum(*state)[chosen])(*state)
         finite = jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in _slopes_of_all(motion, *state)]))
@@ -146,7 +146,7 @@ class Law(NamedTuple):
 
     @np.errstate(all="ignore")
     def _measure_path(self, momenta, tolerances, q, qdot, of, momenta_by_q, finite) -> Measurements:
-        """The `Measurements` of q, q̇ (…, n) from their quantities `of`, ∂pᵢ/∂q (…, k − 1, n) and `finite` (…)."""
+        """Return the `Measurements` of q, q̇ (…, n) from the quantities `of`, ∂pᵢ/∂q (…, k − 1, n) and `finite` (…)."""
         # Arrays of NumPy have an axis of states, those of JAX none.
         xp, (rtol, atol), chosen = qdot.__array_namespace__(), tolerances, np.array(momenta, int)
         of = of if "mass_matrix" not in of else of | _mass_products(xp, of["mass_matrix"], of["jacobian"], qdot, chosen)
@@ -175,7 +175,7 @@ class Law(NamedTuple):
 
     @np.errstate(all="ignore")
     def _energy_power(self, of: dict[str, Any], qdot):
-        """dh/dt = −∂L/∂t + Q·q̇ + λ·(G q̇), where G q̇ = −∂f/∂t, and −a(q, 0, t) for velocities, (…)."""
+        """Return dh/dt = −∂L/∂t + Q·q̇ + λ·(G q̇), where G q̇ = −∂f/∂t, and −a(q, 0, t) for velocities, (…)."""
         xp = qdot.__array_namespace__()
         if not self.works:
             return xp.zeros_like(of["lagrangian_by_t"])
@@ -190,7 +190,7 @@ _QUANTITIES = ("lagrangian", "momentum", "energy_by_q", "residual", "rates", *SA
 
 
 def _mass_products(xp, mass, jacobian, qdot, chosen) -> dict[str, Any]:
-    """M q̇, the rows of M of the `chosen` coordinates, the lengths of the rows of G and what `_conditions` gives."""
+    """Return M q̇, the rows of M of the `chosen` coordinates, the row norms of G, and `_conditions` of M."""
     return {
         "energy_by_qdot": xp.einsum("...ij,...j->...i", mass, qdot),
         "momenta_by_qdot": mass[..., chosen, :],
@@ -200,13 +200,13 @@ def _mass_products(xp, mass, jacobian, qdot, chosen) -> dict[str, Any]:
 
 
 def _conditions_of_diagonal(values):
-    """`_conditions` of a diagonal matrix, from its diagonal (n,)."""
+    """Return the same as `_conditions` for a diagonal matrix, given its diagonal (n,)."""
     size = jnp.abs(values)
     return jnp.stack([jnp.min(values), jnp.max(size) / jnp.min(size), jnp.where(jnp.min(size) > 0, 1.0, jnp.inf)])
 
 
 def _conditions(matrix):
-    """The smallest eigenvalue of symmetric matrices (…, n, n), max|λ| / min|λ| and that ratio after scaling, (…, 3)."""
+    """Return min λ, max|λ| / min|λ| and that ratio after scaling, (…, 3), of symmetric matrices (…, n, n)."""
     # The matrix and the one scaled to a unit diagonal go into one call: LAPACK's kernels side by side in one program of
     # JAX deadlock (`_linear`).
     xp = matrix.__array_namespace__()
@@ -216,7 +216,7 @@ def _conditions(matrix):
 
 
 def _eigenvalues(xp, matrix):
-    """The eigenvalues (…, n) of symmetric matrices (…, n, n); NaN where a matrix is not finite."""
+    """Return the eigenvalues (…, n) of symmetric matrices (…, n, n); NaN where a matrix is not finite."""
     n = matrix.shape[-1]
     if n == 1:
         return matrix[..., 0]
@@ -235,7 +235,7 @@ def _eigenvalues(xp, matrix):
 
 
 def _conservation_flags(system: System, derivation: Derivation) -> tuple[bool, tuple[int, ...] | None]:
-    """A flag that anything does work, and the coordinates on which no force of any kind acts (None: not known)."""
+    """Return whether any force does work, and the coordinates on which no force acts (None: not known)."""
     try:
         return derivation.works, derivation.conserved
     except Unlowerable:
@@ -249,7 +249,7 @@ def _conservation_flags(system: System, derivation: Derivation) -> tuple[bool, t
 
 
 def _slopes_of_all(motion: Motion, q, qdot, t, params) -> list[jax.Array]:
-    """The derivatives of the sum of M, F, G and γ by q, q̇, t and every parameter."""
+    """Return the derivatives of the sum of M, F, G and γ by q, q̇, t and every parameter."""
     floats, others = eqx.partition(params, lambda leaf: jnp.issubdtype(jnp.result_type(leaf), jnp.inexact))
 
     def total(q, qdot, t, floats):

@@ -1,8 +1,8 @@
-"""From the states of a trajectory to the arrays of a report.
+"""Computes the fields of `Health` from the states of a trajectory.
 
-The arrays have the axes (…, state, component). In NumPy the programs of the scene evaluate all members of a batch
-together; where values are being traced, or the scene has no programs, the functions of one member are evaluated in JAX,
-under `jit` and `vmap`. What follows from the measured states is written once, for arrays of either library.
+Arrays have the axes (…, state, component). In NumPy the scalar programs evaluate all members of a batch together; for
+traced values, and for scenes without programs, the functions of one member are evaluated in JAX, under `jit` and
+`vmap`. The computation from these values is written once, for arrays of either library.
 """
 
 import dataclasses
@@ -43,7 +43,7 @@ class Extreme(NamedTuple):
 
 
 class SampledPath(NamedTuple):
-    """The S states of one member, or of N members with a first axis (N, …) in NumPy, and the tolerances of the run."""
+    """The S states of one member, or in NumPy of N members with a first axis (N, …), and the run's tolerances."""
 
     q: Any  # (…, S, n), of the T outputs, then of the states just before each transition
     qdot: Any  # (…, S, n)
@@ -57,7 +57,7 @@ class SampledPath(NamedTuple):
 
     @property
     def library(self):
-        """NumPy or `jax.numpy`."""
+        """NumPy or `jax.numpy`, whichever the arrays are of."""
         return np if isinstance(self.q, np.ndarray) else jnp
 
     @property
@@ -65,13 +65,13 @@ class SampledPath(NamedTuple):
         return self.q.ndim - 2
 
     def take_ends(self, x):
-        """The entries at `ends` of an array over states, (…, T − 1, …)."""
+        """Return the entries at `ends` of an array over states, (…, T − 1, …)."""
         ends = self.ends.reshape(self.ends.shape + (1,) * (x.ndim - self.ends.ndim))
         return self.library.take_along_axis(x, ends, axis=self.time)
 
 
 def measure_trajectory(trajectory) -> dict[str, Any]:
-    """The fields of `Health` that are measured along the path, and names for them."""
+    """Return the fields of `Health` that are computed from the states, and the names that go with them."""
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
         if (report := _report_in_doubles(Members(trajectory))) is not None:
             return report
@@ -82,7 +82,7 @@ def measure_trajectory(trajectory) -> dict[str, Any]:
 
 @with_doubles
 def _report_in_doubles(members: Members) -> dict[str, Any] | None:
-    """The report of all members, whose laws are those of float64; None where a scene has no programs."""
+    """Return the fields of `Health` of all members in float64; None if a scene has no scalar programs."""
     layout = dataclasses.replace(members.layout, dtype=DOUBLE)
     laws = _mode_laws(members.trajectory, layout, widen(members.params))
     if not all(law.derivation.is_lowered for law in laws):
@@ -102,13 +102,13 @@ def _mode_laws(trajectory, layout: Layout, params) -> list[Law]:
 
 
 def does_work(trajectory) -> bool:
-    """True if anything does work in some mode of a motion, so that its energy is not constant."""
+    """True if a force or the time does work in some mode of a motion, so that its energy is not constant."""
     members = Members(trajectory)
     return any(law.works for law in _mode_laws(trajectory, members.layout, members.params))
 
 
 def _known_fields(laws: list[Law], layout: Layout) -> dict[str, Any]:
-    """The fields of `Health` that are known without a motion, none of them an array."""
+    """Return the fields of `Health` that do not depend on the motion, none of them an array."""
     momenta = _common_conserved(laws)
     return {
         "works": any(law.works for law in laws),
@@ -140,11 +140,11 @@ def path_of(members: Members) -> SampledPath:
 
 
 def _report_of(members: Members, laws: list[Law]) -> dict[str, Any]:
-    """The fields of `Health` that are measured, with the batch axes of the trajectory."""
+    """Return the measured fields of `Health`, with the batch axes of the trajectory."""
     path, momenta = path_of(members), _common_conserved(laws) or ()
 
     def evaluate_by_mode(function: Callable, q, qdot, t, mode):
-        """`function(law, index, member, sample)` on the states of each mode, in the order of all states, (N, S, …)."""
+        """Evaluate `function(law, index, member, sample)` on the states of each mode; return (N, S, …)."""
         shape, total = t.shape, None
         q, qdot = (np.ascontiguousarray(x.reshape(-1, x.shape[-1])) for x in (q, qdot))
         t, mode = t.reshape(-1), mode.reshape(-1)
@@ -214,7 +214,7 @@ def _measure_traced(trajectory, axes, tree, steps):
 
 
 def _evaluate_mode(laws: list[Law], function: Callable, q, qdot, t, mode):
-    """`function(law, q, qdot, t)` by the law of the state's mode; distances from other modes' constraints are zero."""
+    """Evaluate `function(law, q, qdot, t)` by the law of a state's mode; constraints of other modes give 0."""
     total = None
     for index, law in enumerate(laws):
         value = function(law, q, qdot, t)
@@ -230,7 +230,7 @@ def _evaluate_mode(laws: list[Law], function: Callable, q, qdot, t, mode):
 
 
 def _join_states(xp, outputs: tuple, transitions: tuple | None, steps, tolerances, precision) -> SampledPath:
-    """The path through outputs and the states before transitions, both q, q̇, t and mode (None: there is one)."""
+    """Append the states before transitions to those of outputs, both (q, q̇, t, mode); mode None: a single one."""
     q, qdot, ts, mode = outputs
     ends = xp.broadcast_to(xp.arange(1, ts.shape[-1]), (*ts.shape[:-1], ts.shape[-1] - 1))
     t, mode, dtype = ts, xp.zeros(ts.shape, int) if mode is None else mode, q.dtype
@@ -246,7 +246,7 @@ def _join_states(xp, outputs: tuple, transitions: tuple | None, steps, tolerance
 
 
 def _pad_constraints(measured: Measurements, laws: list[Law], index: int) -> Measurements:
-    """The measurements by one of several laws, with zeros as the distances from the constraints of the others."""
+    """Return one law's measurements, padded with zeros at the constraints of the other laws."""
     counts = [len(law.names) for law in laws]
     around = sum(counts[:index]), sum(counts[index + 1 :])
 
@@ -257,7 +257,7 @@ def _pad_constraints(measured: Measurements, laws: list[Law], index: int) -> Mea
 
 
 def _report(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample: Callable, between: "Rates") -> dict:
-    """All measured fields; `sample(q, qdot, t, mode)` gives the `Measurements` at states."""
+    """Return all measured fields; `sample(q, qdot, t, mode)` returns the `Measurements` at states."""
     xp, axis, T, dtype = path.library, path.time, path.ts.shape[-1], path.q.dtype
     q, qdot, t, mode = path[:4]
     reached = xp.isfinite(q).all(axis=-1) & xp.isfinite(qdot).all(axis=-1) & (mode >= 0)
@@ -303,7 +303,7 @@ def _report(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample
 
 
 def _law_ends(xp, ts, transitions):
-    """The index (…, T − 1) of the state where the law of each output ends: the next output or a transition before."""
+    """Return the index (…, T − 1) of the state where each output's mode ends: next output or earlier transition."""
     T = ts.shape[-1]
     times = xp.where(xp.isnan(transitions), math.inf, transitions)
     before = xp.sum(times[..., None, :] < ts[..., :-1, None], axis=-1)
@@ -314,7 +314,7 @@ def _law_ends(xp, ts, transitions):
 
 
 def _drifts(path: SampledPath, laws, momenta, samples: Measurements, reached, between: "Rates") -> tuple[Any, Any]:
-    """|h − h₀ − W| and |pᵢ − pᵢ₀| at every output, a column each, and how far W may be off, (…)."""
+    """Return |h − h₀ − W| and |pᵢ − pᵢ₀| at every output, a column each, and the error of W, (…)."""
     # A piece of the path, from an output to its entry in `ends`, counts for a quantity that its mode conserves;
     # whatever changes the quantity between there and the next output, such as a transition, is left out.
     xp, until, T, values = path.library, path.take_ends, path.ts.shape[-1], samples.conserved
@@ -335,7 +335,7 @@ def _drifts(path: SampledPath, laws, momenta, samples: Measurements, reached, be
 
 
 class Rates(NamedTuple):
-    """Functions of states (q, q̇, t, mode) between outputs: dh/dt, q̈, and what changes where another piece decides."""
+    """Functions of states (q, q̇, t, mode) between outputs: dh/dt, q̈, and the sides of borders, if piecewise."""
 
     power: Callable
     acceleration: Callable
@@ -343,7 +343,7 @@ class Rates(NamedTuple):
 
 
 def _gauss_rule(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points and weights of Gauss and Legendre on (0, 1): exact for polynomials of degree 2 count − 1."""
+    """Return points and weights of Gauss-Legendre on (0, 1), exact for polynomials of degree 2 count − 1."""
     points, weights = np.polynomial.legendre.leggauss(count)
     return points / 2 + 0.5, weights / 2
 
@@ -360,12 +360,12 @@ INSIDE = 1e-9  # how far from its ends a piece of the path is asked what its pro
 
 
 def _work_integrals(path: SampledPath, samples: Measurements, measurable, between: Rates) -> tuple[Any, Any]:
-    """∫ P dt over every piece, (…, T − 1), and the error of their sum, (…).
+    """Return ∫ P dt between consecutive outputs, (…, T − 1), and the error of their sum, (…).
 
-    Between its ends the motion is replaced by polynomials. The quintic through q, q̇ and q̈ is off by order six in q, and
-    so is W. At two points the equations of motion say how wrong its second derivative is; the polynomial of degree
-    seven that is right there gives W to order eight, with twice as many points, so that a power that four points do not
-    resolve is seen. The difference of both bounds the error. The cubic through q and q̇ is of order four, the
+    The motion between two outputs is replaced by polynomials. The quintic through q, q̇ and q̈ has an error of order
+    six, and so has W. At two points the equations of motion give the error of its second derivative; the polynomial of
+    degree seven that is right there gives W to order eight, with twice as many points, so that a power that four points
+    do not resolve is seen. The difference of both bounds the error. The cubic through q and q̇ is of order four, the
     trapezoidal rule of order two. Where pieces of the program change, the error is as large as the power varies.
     """
     xp, until, last = path.library, path.take_ends, path.ts.shape[-1] - 1
@@ -382,7 +382,7 @@ def _work_integrals(path: SampledPath, samples: Measurements, measurable, betwee
     septic = [*(c + fix for c, fix in zip(quintic, fixes, strict=False)), *fixes[6:]]
 
     def integrate(coefficients, points, weights):
-        """∫ P from s = 0 to 1."""
+        """Return ∫ P ds from s = 0 to 1, times h."""
         powers = _evaluate_on_curves(path, coefficients, between.power, points.astype(dtype))
         return h * xp.sum(powers * weights.astype(dtype), axis=-1)
 
@@ -401,12 +401,12 @@ def _work_integrals(path: SampledPath, samples: Measurements, measurable, betwee
 
 
 def _combine_curves(coefficients, powers) -> Any:
-    """Σ cₖ pₖ of coefficients (…, T − 1, n) and powers (S,), (…, T − 1, S, n)."""
+    """Return Σ cₖ pₖ, (…, T − 1, S, n), of coefficients (…, T − 1, n) and powers (S,)."""
     return sum(c[..., None, :] * x[:, None] for c, x in zip(coefficients, powers, strict=True))
 
 
 def _evaluate_on_curves(path: SampledPath, coefficients, function: Callable, points):
-    """A function of states over polynomials in s with coefficients (…, T − 1, n) of s⁰, s¹, …, at these points (S,)."""
+    """Evaluate a function of states at points s (S,) of polynomials with coefficients (…, T − 1, n) of s⁰, s¹, …."""
     xp, until, last = path.library, path.take_ends, path.ts.shape[-1] - 1
     t, degrees = path.t[..., :last], range(len(coefficients))
     h = until(path.t) - t
@@ -422,7 +422,7 @@ def _evaluate_on_curves(path: SampledPath, coefficients, function: Callable, poi
 
 
 def _hermite_interpolants(begin, end) -> tuple[list, list]:
-    """Coefficients of s⁰, s¹, … of the cubic with these q and dq/ds at s = 0 and 1, and of the quintic with d²q/ds²."""
+    """Return coefficients of s⁰, s¹, … of the cubic with these q, dq/ds at s = 0, 1, and the quintic with d²q/ds²."""
     (q0, v0, a0), (q1, v1, a1) = begin, end
     a0, rise = a0 / 2, q1 - q0
     # The three conditions at s = 1 on the coefficients of s³, s⁴ and s⁵.
@@ -432,7 +432,7 @@ def _hermite_interpolants(begin, end) -> tuple[list, list]:
 
 
 def _work_error(xp, found):
-    """The error of the work of every piece, from its values `found` (4, …) by rules of order 2, 4, 6 and 8."""
+    """Return the error of the work of every piece, from its values `found` (4, …) by rules of order 2, 4, 6, 8."""
     # Once pieces are short enough, errors fall from order to order by the same factor, or a larger one; one of the
     # first two may be small by accident. Where they do not fall eightfold each, the pieces are longer than what they
     # should show, and a small difference proves nothing. Of 240 motions with coarse outputs the work was off by at most
@@ -444,7 +444,7 @@ def _work_error(xp, found):
 
 
 def _count_outputs_needed(xp, T: int, imbalance, work_error, size):
-    """About how many outputs it takes to tell whether the power is balanced; T where the present ones do."""
+    """Return about how many outputs would decide whether the power is balanced; T if the present ones do."""
     # They do not where the balance is off by more than `VISIBLE` of the energy and the error of the work may be as
     # large as both. That error is of order six, so that a sixth root gives the number.
     visible = VISIBLE * size
@@ -454,7 +454,7 @@ def _count_outputs_needed(xp, T: int, imbalance, work_error, size):
 
 
 def _largest_excursion(xp, q, on_path):
-    """The largest change of a coordinate along the path; infinite where nothing moves beyond rounding."""
+    """Return the largest change of a coordinate along the path; infinite if nothing moves beyond rounding."""
     high = xp.max(xp.where(on_path[..., None], q, -math.inf), axis=-2)
     low = xp.min(xp.where(on_path[..., None], q, math.inf), axis=-2)
     largest = xp.max(high - low, axis=-1)
@@ -463,7 +463,7 @@ def _largest_excursion(xp, q, on_path):
 
 
 def _drift_limits(path: SampledPath, here: Measurements, on_path) -> tuple[Any, Any]:
-    """The largest drift of h and the momenta by errors of steps and round-off, and their sizes, (…, k) each."""
+    """Return the drift of h and the momenta that step errors and round-off allow, and their sizes, (…, k) each."""
     # Fixed steps have no tolerances: there `VISIBLE` of the size is the limit.
     xp, n = path.library, path.q.shape[-1]
     slope, size = (xp.max(xp.where(on_path[..., None], x, 0.0), axis=-2) for x in (here.slopes, here.sizes))
@@ -474,7 +474,7 @@ def _drift_limits(path: SampledPath, here: Measurements, on_path) -> tuple[Any, 
 
 
 def extreme(xp, axis: int, ts, values, at, largest: bool = True) -> Extreme:
-    """The extreme of `values` along the axis of time where `at` holds; a NaN there is more extreme than any number."""
+    """Return the extreme of `values` along the time axis where `at` is True; NaN counts as most extreme."""
     extra = (1,) * (values.ndim - ts.ndim)
     at = xp.broadcast_to(at.reshape(at.shape + (1,) * (values.ndim - at.ndim)), values.shape)
     ranked = xp.where(at, values if largest else -values, -math.inf)
