@@ -212,6 +212,11 @@ def cube_edges(q):
     return look(points_at(q, PUBLISHED, CORNERS))[np.array(EDGES)]
 
 
+def edge_lines(q):
+    """The edges as what `plot` draws: x and y, (2, 2, 12)."""
+    return np.asarray(cube_edges(q)).transpose(2, 1, 0)
+
+
 def picture(q):
     """The edges of the cube and its board."""
     return {f"edge {k}": edge for k, edge in enumerate(cube_edges(q))} | {"board": look(BOARD)}
@@ -224,9 +229,8 @@ def draw_own_toss(run):
     figure, axes = plt.subplots(figsize=(7.6, 3.6))
     axes.plot(*np.asarray(look(BOARD)).T, color="0.6")
     for k in range(0, len(run.ts), 8):
-        edges = cube_edges(jax.tree.map(lambda x, k=k: x[k], run.q))
-        lines, color = np.moveaxis(edges, -1, 0).swapaxes(1, 2), plt.colormaps["viridis"](0.9 * k / len(run.ts))
-        axes.plot(*lines, color=color, linewidth=1)
+        lines = edge_lines(jax.tree.map(lambda x, k=k: x[k], run.q))
+        axes.plot(*lines, color=plt.colormaps["viridis"](0.9 * k / len(run.ts)), linewidth=1)
     axes.set(aspect="equal", title="Tossed, and at rest on a face")
     axes.axis("off")
     figure.savefig("out/cube.png")
@@ -253,7 +257,7 @@ def draw_followed(scene, tosses, laws, off):
         cubes[name] = follow_tosses(scene, [toss], law, numbers[None])[0], colors[name], 1
     for k, axis in enumerate(axes[1:]):
         for name, (pictures, color, width) in cubes.items():
-            lines = np.moveaxis(cube_edges(seen_state(pictures[k])), -1, 0).swapaxes(1, 2)
+            lines = edge_lines(seen_state(pictures[k]))
             axis.plot(*lines, color=color, lw=width, solid_capstyle="round", label=[name] + 11 * ["_"])
         axis.set_title(f"{SHOWN[k]} s")
         axis.set(aspect="equal")
