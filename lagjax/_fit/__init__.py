@@ -54,9 +54,9 @@ from lagjax._scene import HOLDS
 
 PyTree = Any
 _METHODS = ("auto", "segments", "whole", "gradient")
-# Free numbers from which on a sentence says that another method may be meant. Of a network of 337 a trial takes half a
-# minute, and the gradient's whole descent as long; scenes of 50 need no such advice.
-_MANY_UNKNOWNS = 100
+# Free numbers from which on a sentence says that another method may be meant. A trial of 288 numbers and 20 records of
+# 241 samples takes 1.8 s; of a network of 337 it took half a minute, and the gradient's whole descent as long.
+_MANY_UNKNOWNS = 300
 # Of motion that sticks, or strikes, where one start is not enough: 16 at a time, until they are. Of 12 guesses of a
 # block that sticks and slips, up to three times off, one start was enough for 1, 16 for 7, 48 for 3, and 64 for 1.
 _STARTS_AT_A_TIME, _TIMES = 16, 4
@@ -165,8 +165,9 @@ def fit(
     given = read_systems(system, records, params0, observe, hold)
     build = functools.partial(Parameters.from_pytree, params0, free, transforms)
     search = _FitSearch(params0, build, noise, starts and int(starts), method, int(seed), progress)
-    followed = build(sum(len(one.records) for one in given)).unknowns.columns.shape[1]
-    if followed > _MANY_UNKNOWNS and method != "gradient":
+    parameters = build(sum(len(one.records) for one in given))
+    followed = parameters.unknowns.columns.shape[1]
+    if followed > _MANY_UNKNOWNS and method != "gradient" and not parameters.prior_weights.any():
         warnings.warn(
             f"{followed} numbers are free, and with method={method!r} every trial follows that many derivatives "
             "of every motion, which may take minutes each. method='gradient' takes all of them at once, in reverse: it "
@@ -235,9 +236,11 @@ class _FitSearch(NamedTuple):
         self, residuals: Residuals, search: Search, point: Point, looks_further: bool
     ) -> tuple[Descent, Waterfall | None]:
         """The end of the search from the starts that were asked for; where that is left to it, from one, and from more
-        if that one is not enough. Raises `LostMotion` where none can be followed."""
+        if that one is not enough: of learned functions, which have one least for a smoothness, evidence says so later.
+        Raises `LostMotion` where none can be followed."""
         tell, lost, chooses = _print_line if self.progress else None, None, looks_further and self.starts is None
         chooses &= len(residuals.parameters) > 0 and any(jumps(part.scene) for part in residuals.parts)
+        chooses &= not residuals.parameters.prior_weights.any()
         done, misfits = None, np.zeros(0)
         try:
             done, waterfall = run_multistart(residuals, search, point, self.starts or 1, self.seed, tell)

@@ -676,8 +676,8 @@ def test_transforms_by_element():
 def test_a_fit_of_very_many_numbers_names_the_method_that_is_meant_for_it():
     ts = np.linspace(0.0, 2.0, 21)
     record = lagjax.Record(ts, np.cos(1.1 * ts), start=(1.0, 0.0))
-    with pytest.warns(UserWarning, match=r"101 numbers are free.*method='gradient'"):
-        lagjax.fit(MANY_WEIGHTS, record, {"w": np.full(101, 0.1)}, method="whole")
+    with pytest.warns(UserWarning, match=r"301 numbers are free.*method='gradient'"):
+        lagjax.fit(MANY_WEIGHTS, record, {"w": np.full(301, 0.1)}, method="whole")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        lagjax.fit(MANY_WEIGHTS, record, {"w": np.full(50, 0.1)}, method="whole")
+        lagjax.fit(MANY_WEIGHTS, record, {"w": np.full(101, 0.1)}, method="whole")

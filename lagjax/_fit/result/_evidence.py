@@ -28,7 +28,8 @@ from lagjax._fit.model._transforms import Smooth
 from lagjax._fit.result._information import parameter_rows
 from lagjax._fit.search._descent import Descent, minimise
 
-_ENOUGH, _TRIALS = 1e-3, 60  # of each search, as of the first
+_ENOUGH, _TRIALS = 1e-3, 60  # of the last search
+_ENOUGH_OF_ROUND = 1e-3  # of those before for each sample: a strength that will change needs a rough fit
 _ROUNDS = 20  # of fits, most of which take two trials
 _SAME = 0.1  # |log λ| between two fits: intervals differ by a hundredth
 _INNER, _INNER_SAME = 200, 1e-3  # rounds in the linear model
@@ -74,19 +75,19 @@ def find_smoothness(done: Descent, law: AbstractNoise, tell: Callable[[str], Non
         pace *= 0.5 if any(moves[name] * last.get(name, 0.0) < 0.0 for name in moves) else 1.0
         strengths, last = {name: before[name] * math.exp(pace * moves[name]) for name in before}, moves
         residuals = done.residuals.with_parameters(done.residuals.parameters.replace_strengths(strengths))
-        again = minimise(residuals, done.trial.point, law, _ENOUGH, _TRIALS)
-        trials += again.trials
-        done = again._replace(converged=done.converged and again.converged, message=done.message)
+        done = minimise(residuals, done.trial.point, law, _ENOUGH_OF_ROUND * residuals.measured, _TRIALS)
+        trials += done.trials
         if tell is not None:
             tell(", ".join(f"{name}: strength {value:.3g}" for name, value in strengths.items()))
         if max(map(abs, moves.values())) < _SAME:
             text = ""
             break
+    done = minimise(done.residuals, done.trial.point, law, _ENOUGH, _TRIALS)
     square = _data_square(done.residuals, done.trial, done.noise)
     covariance = _covariance(square, done.residuals.parameters.prior_weights**2)
     said = [text] * bool(text) + [_sentence(covariance, part) for part in smooth_parts(done.residuals.parameters)]
     message = " ".join([done.message, *said])
-    return done._replace(converged=done.converged and not text, trials=trials, message=message)
+    return done._replace(converged=done.converged and not text, trials=trials + done.trials, message=message)
 
 
 def smooth_parts(parameters: Parameters) -> list[SmoothPart]:

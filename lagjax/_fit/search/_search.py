@@ -87,13 +87,18 @@ class Search:
     # ---- whole records ----
 
     def _minimise_whole(self, point: Point) -> Descent:
-        """The search of whole records from a point; that of many begins where the search of a sample of them ends."""
-        places = self._sample_records()
+        """The search of whole records from a point; that of many begins where the search of a sample of them ends.
+
+        Learned functions need a rough answer here: their prior is still weak, and a search to the end would creep along
+        what data do not tell; evidence ends it (`find_smoothness`).
+        """
+        places, learned = self._sample_records(), self.residuals.parameters.prior_weights.any()
+        enough = _ENOUGH_OF_LEVEL * self.residuals.measured if learned else _ENOUGH
         if len(places) < len(self.residuals.pieces):
             with contextlib.suppress(LostMotion):
                 begin = self._minimise_sample(point, places, None)
-                return minimise(self.residuals, begin, self.law, _ENOUGH, _TRIALS)
-        return minimise(self.residuals, point, self.law, _ENOUGH, _TRIALS)
+                return minimise(self.residuals, begin, self.law, enough, _TRIALS)
+        return minimise(self.residuals, point, self.law, enough, _TRIALS)
 
     def _sample_records(self) -> np.ndarray:
         """The places of all pieces, or of an even sample of them where a part says enough about the parameters."""
