@@ -4,6 +4,7 @@ import gc
 import hashlib
 import itertools
 import os
+import sys
 import threading
 from importlib.metadata import version
 from pathlib import Path
@@ -79,6 +80,14 @@ llvmlite.binding.set_option("", "-fast-isel=false")
 # one it ends in a segmentation fault, as a worker did after hundreds of slow tests. Kept programs come back fast.
 _MAPS, _MOST_MAPS, _BETWEEN = Path("/proc/self/maps"), 25_000, 20
 _tests_run = itertools.count(1)
+
+
+@pytest.fixture(autouse=True)
+def _own_style():
+    """Examples set the style of figures where they are imported; the next test has Matplotlib's own."""
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib"].rcdefaults()  # but for the backend
 
 
 @pytest.fixture(autouse=True)
