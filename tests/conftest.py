@@ -55,16 +55,22 @@ jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 # For every program JAX makes a context of MLIR, with all dialects in it, and keeps it: of the 18 ms and the 1.3 MB that
-# one of a single operation takes, 7 ms and 1.2 MB. Here each thread has one for all of its programs.
+# one of a single operation takes, 7 ms and 1.2 MB. Here each thread has one for all of its programs; but a program that
+# is lowered while another one is (an implicit solver's) has its own, or MLIR would put its clone into the outer one.
 if version("jax").startswith("0.10."):
     from jax._src.interpreters import mlir
+    from jaxlib.mlir import ir
 
     _make_context, _kept = mlir.make_ir_context, threading.local()
 
     def _context_of_thread():
-        if not hasattr(_kept, "context"):
-            _kept.context = _make_context()
-        return _kept.context
+        try:
+            ir.Context.current
+        except ValueError:  # no program is being lowered
+            if not hasattr(_kept, "context"):
+                _kept.context = _make_context()
+            return _kept.context
+        return _make_context()
 
     mlir.make_ir_context = _context_of_thread
 
