@@ -25,13 +25,31 @@ class Correlation(NamedTuple):
     neighbour: float
 
 
-def autocorrelations(residuals: Residuals, point: Trial, noise: NoiseScale) -> list[Correlation]:
-    return [_autocorrelation(residuals, point, noise, signal) for signal in range(len(noise.sigma))]
+def autocorrelations(
+    residuals: Residuals, point: Trial, noise: NoiseScale, fitted: np.ndarray | None = None
+) -> list[Correlation]:
+    """The correlation of each signal's noise. `fitted` (S, T): Σ gᵢ gᵢ₊ₖ of the directions g that were fitted.
+
+    Along those directions residuals have lost their noise, whose power there is f = Σ cₖ Σ gᵢ gᵢ₊ₖ/Σ gᵢ² for
+    correlations c. It is added again: residuals alone forget sooner than the noise does.
+    """
+    found = []
+    fitted = np.zeros((len(noise.sigma), 1)) if fitted is None else fitted
+    for signal in range(len(noise.sigma)):
+        sums, count = _residual_products(residuals, point, noise, signal)
+        law = _correlation(sums, count)
+        for _ in range(_ROUNDS if len(law.lags) > 1 and fitted[signal, 0] > 0 else 0):
+            lost = fitted[signal, : len(sums)]
+            power = (2 * lost[: len(law.lags)] @ law.lags - lost[0]) / lost[0]
+            if not power * lost[0] < _MOST_FITTED * count:  # residuals hold motion, or nearly nothing else was there
+                break
+            law = _correlation(sums + power * sums[0] / (count - power * lost[0]) * lost, count)
+        found.append(law)
+    return found
 
 
-def _autocorrelation(residuals: Residuals, point: Trial, noise: NoiseScale, signal: int) -> Correlation:
-    """The correlation of one signal's residuals: cut at two standard errors and tapered by Parzen's window, or that of
-    an autoregression, if its sum is larger."""
+def _residual_products(residuals: Residuals, point: Trial, noise: NoiseScale, signal: int) -> tuple[np.ndarray, int]:
+    """The lag products (T,) of one signal's residuals in units of their scatter, and the number of its samples."""
     dof = noise.dof[signal]
     sums, count = np.zeros(1), 0
     for batch, r in zip(residuals.batches, point.residuals, strict=True):
@@ -44,6 +62,12 @@ def _autocorrelation(residuals: Residuals, point: Trial, noise: NoiseScale, sign
         count += round(curvature.sum(where=counted))
         length = max(len(sums), len(own))
         sums = np.pad(sums, (0, length - len(sums))) + np.pad(own, (0, length - len(own)))
+    return sums, count
+
+
+def _correlation(sums: np.ndarray, count: int) -> Correlation:
+    """The correlation cut at two standard errors and tapered by Parzen's window, or that of an autoregression, if its
+    sum is larger, from lag products (T,) of `count` samples."""
     law = sums / sums[0] if sums[0] > 0 else np.eye(1, len(sums))[0]
     insignificant = np.flatnonzero(law <= 2.0 / np.sqrt(count))
     cut = int(insignificant[0]) if len(insignificant) else len(law)
@@ -57,6 +81,10 @@ def _autocorrelation(residuals: Residuals, point: Trial, noise: NoiseScale, sign
     return Correlation(lags, float(max(1.0, lags[0] + 2 * lags[1:].sum())), count, float(law[1]))
 
 
+_ROUNDS = (
+    3  # in which the power of fitted noise is found: each leaves a part (unknowns/independent samples) of an error
+)
+_MOST_FITTED = 0.5  # of the power of the noise, along what was fitted
 _MOST_ORDER = 20  # of autoregressions
 _FORGETS = 10  # part of a record after which noise is forgotten: residuals that remember longer hold motion, not noise
 

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from lagjax._equations import decide
-from lagjax._fit.model._autocorrelation import autocorrelations, close_gaps, correlated_square
+from lagjax._fit.model._autocorrelation import autocorrelations, close_gaps, correlated_square, lag_products
 from lagjax._fit.model._noise import harmonics, rounding_square
 from lagjax._fit.model._parameters import Unknowns
 from lagjax._fit.model._residuals import Residuals, Trial, compress_rows
@@ -102,16 +102,20 @@ def information(descent: Descent) -> Information:
     free, states = len(trial.u), residuals.states
     if _largest_slope(residuals, trial) > _LOST and growth(row_sizes(residuals, trial)) > _LOST:
         null, basis = np.eye(free), np.zeros((free, 0))
-    laws = autocorrelations(residuals, trial, noise)
-    effective, correlation = (np.array(x) for x in zip(*((a.count / a.time, a.neighbour) for a in laws), strict=True))
     unit = _lengths(triangles, states, unknowns)  # of columns: their squares may be no numbers
     unit_of = np.append(unit, 1.0)[unknowns.columns][:, None, None]
+    basis = basis * unit[:, None]
+    rows = np.concatenate([parameter_rows(triangles, states, unknowns) / unit, np.diag(prior / unit)])
+    half = basis @ np.linalg.solve(basis.T @ (rows.T @ rows) @ basis, basis.T)
+    weighted = [factor[..., None] * slopes for factor, slopes in zip(factors, trial.slopes, strict=True)]
+    rows_of = [eliminate_starts(triangles[b.rows], own, states) / unit_of[b.rows]
+               for b, own in zip(residuals.batches, weighted, strict=True)]  # fmt: skip
+    laws = autocorrelations(residuals, trial, noise, _fitted_products(residuals, triangles, weighted, rows_of, half))
+    effective, correlation = (np.array(x) for x in zip(*((a.count / a.time, a.neighbour) for a in laws), strict=True))
     share = effective.sum() / max(sum(law.count for law in laws), 1)  # a prior is worth more beside correlated samples
-    middle, rows_of = np.diag((prior / unit) ** 2 / share), []
-    for batch, factor, slopes in zip(residuals.batches, factors, trial.slopes, strict=True):
-        own, columns = factor[..., None] * slopes, unknowns.select(batch.rows)
-        own = eliminate_starts(triangles[batch.rows], own, states) / unit_of[batch.rows]
-        rows_of.append(own)
+    middle = np.diag((prior / unit) ** 2 / share)
+    for batch, own in zip(residuals.batches, rows_of, strict=True):
+        columns = unknowns.select(batch.rows)
         for s in np.flatnonzero(np.isnan(residuals.sensor.step)):
             middle += columns.add(correlated_square(close_gaps(own[:, :, s], batch.weights[..., s] > 0), laws[s].lags))
     for s in np.flatnonzero(np.isfinite(residuals.sensor.step)).tolist():
@@ -131,9 +135,6 @@ def information(descent: Descent) -> Information:
     used = free - null.shape[1] + residuals.free_states
     lost = max(effective.sum() / max(effective.sum() - used, 1.0), 1.0)
     robust = np.mean([1.0 if np.isinf(d) else (d + 3) / (d + 1) for d in noise.dof])
-    rows, basis = parameter_rows(triangles, states, unknowns) / unit, basis * unit[:, None]
-    rows = np.concatenate([rows, np.diag(prior / unit)])
-    half = basis @ np.linalg.solve(basis.T @ (rows.T @ rows) @ basis, basis.T)
     white = robust * half / unit / unit[:, None]
     covariance = lost * robust * half @ middle @ half.T / unit / unit[:, None]
     unseen = np.linalg.norm(null, axis=1) > 1e-6 if null.size else np.zeros(free, bool)
@@ -142,6 +143,26 @@ def information(descent: Descent) -> Information:
     covariance[unseen, unseen] = np.inf
     confirmed = null if not null.size else confirmed_null(residuals, trial, null)
     return Information(covariance, null, confirmed, effective, correlation, white, float(lost))
+
+
+def _fitted_products(residuals: Residuals, triangles, weighted: list, rows_of: list, half: np.ndarray) -> np.ndarray:
+    """The lag products (S, T) of the directions in which fitted unknowns, and starts, took noise out of residuals."""
+    states, signals = residuals.states, len(residuals.size)
+    total = np.zeros((signals, max(own.shape[1] for own in rows_of)))
+    for batch, raw, own in zip(residuals.batches, weighted, rows_of, strict=True):
+        columns = np.minimum(residuals.unknowns.columns[batch.rows], len(half))
+        values, vectors = np.linalg.eigh(np.pad(half, (0, 1))[columns[:, :, None], columns[:, None]])
+        found = [own @ (vectors * np.sqrt(np.maximum(values, 0.0))[:, None])[:, None]]
+        if states:
+            decided = decide(triangles[batch.rows, :states, :states], _UNFELT)
+            kept = np.arange(states) < decided.rank[:, None]
+            inverse = np.where(kept, 1.0 / np.where(kept, decided.values, 1.0), 0.0)
+            found.append(raw[..., :states] @ (decided.right * inverse[:, None])[:, None])
+        for s in range(signals):
+            counted = batch.weights[..., s] > 0
+            for direction in np.moveaxis(np.concatenate(found, axis=-1)[:, :, s], -1, 0):
+                total[s, : own.shape[1]] += lag_products(direction, counted)
+    return total
 
 
 def _largest_slope(residuals: Residuals, trial: Trial) -> float:
