@@ -199,6 +199,8 @@ def spoil_kind(case: Case, draw: Callable[..., Any], mistake: str | None, rng) -
         words = rf"{words}|late|early|shift"
     elif mistake == "mirrored":
         spoiled = replace(spoiled, values=jax.tree.map(np.negative, spoiled.values))
+        if "offset" in more:  # no mistake: the mirrored motion is one, too, and the sensor's offset has the other sign
+            more["offset"][which] *= -1
     elif mistake == "another machine":
         name = rng.choice(list(case.truth))
         others, _ = draw(rng, {**case.truth, name: case.truth[name] * rng.choice([0.7, 1.4])})
