@@ -17,8 +17,10 @@ import pytest
 from lagrangians import spring
 from scenes import SPRING_K
 from scipy.optimize import least_squares
+from scipy.signal import lfilter
 
 import lagjax
+from benchmarks import coverage
 from lagjax._fit import Parameters
 from lagjax._fit.model import _autocorrelation, _residuals, _signals, _transforms
 from lagjax._fit.model._motions import _JaxMotions, choose_motions
@@ -523,6 +525,32 @@ def test_the_correlations_of_an_autoregression_are_those_of_the_closed_form(size
     law = size**lags * (np.sin(turn * lags + phase) / np.sin(phase) if turn else 1.0)
     found = _autocorrelation.autoregressive_lags(np.concatenate([law, np.zeros(40)]), 1000)
     np.testing.assert_allclose(found[:60], law, atol=1e-10)
+
+
+def test_noise_that_was_fitted_counts_for_its_correlation():
+    rng, i, size = np.random.default_rng(0), np.arange(600), 0.9
+    fitted = np.linalg.qr(np.stack([wave(rate * i) for rate in (0.05, 0.07) for wave in (np.sin, np.cos)], axis=1))[0]
+    kick, times = np.sqrt(1 - size**2) * rng.normal(size=(100, len(i) + 200)), np.zeros((100, 3))
+    noise = lfilter([1.0], [1.0, -size], kick)[:, 200:]
+    lost, every, none = _autocorrelation.lag_products(fitted.T, np.ones((4, 600), bool)), np.ones((1, 600), bool), [0.0]
+    for draw, e in enumerate(noise):
+        left = e - fitted @ (fitted.T @ e)
+        for k, (signal, directions) in enumerate(((e, none), (left, lost), (left, none))):
+            sums = _autocorrelation.lag_products(signal[None], every)
+            times[draw, k] = _autocorrelation.noise_correlation(sums, 600, np.array(directions)).time
+    known, found, forgetful = np.median(times, axis=0)
+    np.testing.assert_allclose(known, (1 + size) / (1 - size), rtol=0.12)  # of 100 draws, three standard errors
+    assert forgetful < 0.95 * known < found < 1.05 * known
+
+
+@pytest.mark.slow
+def test_a_valley_that_bends_is_followed_to_its_end():
+    for draw in (0, 4, 10, 11):  # of straight steps 200 were not enough
+        chaotic = coverage.draw_chaotic(np.random.default_rng([0, draw]))
+        fitted = lagjax.fit(chaotic.scene, chaotic.records, {k: 1.1 * x for k, x in chaotic.truth.items()})
+        low, high = fitted.intervals(0.999)
+        assert fitted.ok, fitted.message
+        assert all(low[k] <= x <= high[k] for k, x in chaotic.truth.items())
 
 
 def test_a_signal_is_called_as_the_function_that_observes_it():

@@ -28,24 +28,27 @@ class Correlation(NamedTuple):
 def autocorrelations(
     residuals: Residuals, point: Trial, noise: NoiseScale, fitted: np.ndarray | None = None
 ) -> list[Correlation]:
-    """The correlation of each signal's noise. `fitted` (S, T): Σ gᵢ gᵢ₊ₖ of the directions g that were fitted.
+    """The correlation of each signal's noise. `fitted` (S, T): Σ gᵢ gᵢ₊ₖ over the directions g that were fitted."""
+    fitted = np.zeros((len(noise.sigma), 1)) if fitted is None else fitted
+    pairs = (_residual_products(residuals, point, noise, signal) for signal in range(len(noise.sigma)))
+    return [noise_correlation(*pair, lost) for pair, lost in zip(pairs, fitted, strict=True)]
 
-    Along those directions residuals have lost their noise, whose power there is f = Σ cₖ Σ gᵢ gᵢ₊ₖ/Σ gᵢ² for
+
+def noise_correlation(sums: np.ndarray, count: int, fitted: np.ndarray) -> Correlation:
+    """The correlation of noise from the lag products (T,) of `count` residuals, and of unit directions `fitted` (T′,).
+
+    Along what was fitted residuals have lost their noise, whose power there is f = Σ cₖ Σ gᵢ gᵢ₊ₖ/Σ gᵢ² for
     correlations c. It is added again: residuals alone forget sooner than the noise does.
     """
-    found = []
-    fitted = np.zeros((len(noise.sigma), 1)) if fitted is None else fitted
-    for signal in range(len(noise.sigma)):
-        sums, count = _residual_products(residuals, point, noise, signal)
-        law = _correlation(sums, count)
-        for _ in range(_ROUNDS if len(law.lags) > 1 and fitted[signal, 0] > 0 else 0):
-            lost = fitted[signal, : len(sums)]
-            power = (2 * lost[: len(law.lags)] @ law.lags - lost[0]) / lost[0]
-            if not power * lost[0] < _MOST_FITTED * count:  # residuals hold motion, or nearly nothing else was there
-                break
-            law = _correlation(sums + power * sums[0] / (count - power * lost[0]) * lost, count)
-        found.append(law)
-    return found
+    law, lost = _correlation(sums, count), fitted[: len(sums)]
+    for _ in range(_ROUNDS if len(law.lags) > 1 and lost[0] > 0 else 0):
+        power = (2 * lost[: len(law.lags)] @ law.lags[: len(lost)] - lost[0]) / lost[0]
+        if not power * lost[0] < _MOST_FITTED * count:  # residuals hold motion, or little else was there
+            break
+        whole = sums.copy()
+        whole[: len(lost)] += power * sums[0] / (count - power * lost[0]) * lost
+        law = _correlation(whole, count)
+    return law
 
 
 def _residual_products(residuals: Residuals, point: Trial, noise: NoiseScale, signal: int) -> tuple[np.ndarray, int]:
