@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._fit.model._assembly import GivenSystem, assemble_residuals, read_systems
+from lagjax._fit.model._blas import one_blas_thread
 from lagjax._fit.model._law_parameters import AbstractLaw, LawParameters, find_laws, terms
 from lagjax._fit.model._noise import AbstractNoise, Clipped, Gaussian, Quantised, StudentT
 from lagjax._fit.model._parameters import Parameters, per_record
@@ -63,6 +64,7 @@ _STARTS_AT_A_TIME, _TIMES = 16, 4
 
 
 @with_doubles
+@one_blas_thread()
 def fit(
     system: Scene | dict[str, Scene],
     records: Record | Timings | list | dict[str, Any],

@@ -27,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import log_ndtr
 
+from lagjax._fit.model._blas import one_blas_thread
 from lagjax._fit.model._inputs import constant_tables, input_functions, inputs_at
 from lagjax._fit.model._motions import AbstractMotions, Manifold, Origins, RecordMotion
 from lagjax._fit.model._noise import AbstractNoise, NoiseScale, Sensor, counts, log_likelihood, scores, worths
@@ -586,24 +587,20 @@ class Residuals:
         return {part.name: tuple(values[part.frame.records]) for part in self.parts}
 
 
+@one_blas_thread()
 def qr_triangle(rows: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
-_BLOCK = 8  # times as many rows as columns in one factorisation, and twice as many at least
-# Numbers in one factorisation, for which OpenBLAS takes one thread (up to 9216). Of twice as many, of 64 columns, its
-# threads wait for each other: 50 times the processor time on a busy machine.
-_BLOCK_NUMBERS = 8192
+_BLOCK = 8  # times as many rows as columns in one factorisation
 
 
 def compress_rows(rows: np.ndarray) -> np.ndarray:
-    """The triangles (N, D, D) of N tall matrices (N, M, D), block by block. Blocks stay in the cache, and are too small
-    for a BLAS to start threads that wait for each other."""
+    """The triangles (N, D, D) of N tall matrices (N, M, D), block by block: blocks stay in the cache."""
     pieces, _, columns = rows.shape
     rows = rows if columns else rows[:, :0]
     while rows.shape[1] > columns:
-        height = max(2 * columns, min(_BLOCK * columns, _BLOCK_NUMBERS // columns))
-        height = min(height, rows.shape[1])
+        height = min(_BLOCK * columns, rows.shape[1])
         if missing := -rows.shape[1] % height:
             rows = np.concatenate([rows, np.zeros((pieces, missing, columns))], axis=1)
         rows = qr_triangle(rows.reshape(-1, height, columns)).reshape(pieces, -1, columns)
