@@ -48,7 +48,7 @@ from lagjax._fit.search._descent import Descent
 from lagjax._fit.search._multistart import Waterfall, run_multistart
 from lagjax._fit.search._reader import TimeScales, first_starts, read_records, time_scales
 from lagjax._fit.search._search import Search, search_again
-from lagjax._fit.search._unexplained import Unexplained
+from lagjax._fit.search._unexplained import Unexplained, measure_unexplained
 from lagjax._primitives import with_doubles
 from lagjax._run.hybrid import Scene, jumps
 from lagjax._scene import HOLDS
@@ -210,6 +210,18 @@ class _FitSearch(NamedTuple):
         Motion that sticks, or strikes, has many minima: with `looks_further` more starts are tried where one leaves
         motion, and candidate terms are chosen.
         """
+        descent, waterfall = self.search(given, looks_further)
+        tell, selection = _print_line if self.progress else None, None
+        descent = find_smoothness(descent, self.law, tell)
+        laws = [law for law in find_laws(self.params0) if law.law.selects]
+        if laws and looks_further:
+            descent, selection = select_terms(descent, self.law, laws, tell)
+        return Fit.from_descent(descent, self.law, waterfall, selection)
+
+    def search(
+        self, given: list[GivenSystem], looks_further: bool = False, rough: bool = False
+    ) -> tuple[Descent, Waterfall | None]:
+        """The end of the search of records, of all terms and with a weak prior of learned functions."""
         parameters = self.build(sum(len(one.records) for one in given))
         residuals = assemble_residuals(given, parameters, self.law)
         self._require_one_beginning(residuals)
@@ -220,19 +232,14 @@ class _FitSearch(NamedTuple):
         residuals = begin_weakly(residuals, point, self.law)
         if self.progress:
             residuals.watch = _print_trials(residuals.size)
-        search = Search(residuals, self.law, self.method, readers)
+        search = Search(residuals, self.law, self.method, readers, rough)
         if self.method == "gradient":
             descent = search.descend_gradient(point)
         else:
             descent, waterfall = self._descend(residuals, search, point, looks_further)
             descent = search_again(descent, self.law)
         residuals.watch = descent.residuals.watch = None
-        descent = find_smoothness(descent, self.law, _print_line if self.progress else None)
-        laws, selection = [law for law in find_laws(self.params0) if law.law.selects], None
-        if laws and looks_further:
-            tell = _print_line if self.progress else None
-            descent, selection = select_terms(descent, self.law, laws, tell)
-        return Fit.from_descent(descent, self.law, waterfall, selection)
+        return descent, waterfall
 
     def _descend(
         self, residuals: Residuals, search: Search, point: Point, looks_further: bool
@@ -293,7 +300,7 @@ class _FitSearch(NamedTuple):
 
         def share(records: list[Any]) -> float | None:
             try:
-                _, left = once.fit([system._replace(records=records)])
+                left = measure_unexplained(once.search([system._replace(records=records)], rough=True)[0])
             except ValueError:
                 return None
             return None if left.motion else left.share

@@ -95,6 +95,12 @@ class _Model:
         pulled = 0.5 * float(np.sum(self.anchor.pull(trial.u) ** 2))
         return self.residuals.cost(trial, self.factors, self.noise) + pulled
 
+    def evaluate(self, point: Point) -> tuple[Trial, float]:
+        """The trial at a point, with derivatives if it is better, and by how much it is. Raises `LostMotion`."""
+        trial = self.residuals.evaluate(point, slopes=False)
+        fall = self.cost - self.cost_of(trial)
+        return self.residuals.evaluate(point, begun=trial) if fall > 0.0 else trial, fall
+
     def step(self, damping: float, limits: tuple[np.ndarray, np.ndarray] | None = None) -> DescentStep:
         u, states, unknowns = self.trial.u, self.residuals.states, self.unknowns
         limits = self.residuals.parameters.limits(u) if limits is None else limits
@@ -114,8 +120,8 @@ class _Model:
             for part in (1.0, 0.1, 0.01):
                 with contextlib.suppress(LostMotion):
                     u = residuals.parameters.take_step(at.u, part * step.u)
-                    trial = residuals.evaluate(Point(u, at.starts + part * step.starts))
-                    if not self.is_enough(self.cost - self.cost_of(trial), enough):
+                    trial, fall = self.evaluate(Point(u, at.starts + part * step.starts))
+                    if not self.is_enough(fall, enough):
                         return step.gain, trial
         return step.gain, None
 
@@ -127,17 +133,18 @@ class _Model:
 
 
 def minimise(
-    residuals: Residuals, point: Point, law: AbstractNoise, enough: float, limit: int = 60, anchor: Anchor | None = None
-) -> Descent:
-    """The unknowns that make the measurements likeliest, by a search from a point.
+    residuals: Residuals, begin: Point | Trial, law: AbstractNoise, enough: float, limit: int = 60,
+    anchor: Anchor | None = None,
+) -> Descent:  # fmt: skip
+    """The unknowns that make the measurements likeliest, by a search from a point, or from a trial of these residuals.
 
     It ends when a step without damping, within the reach of the transforms, promises to lower half the sum of squares,
     in units of the noise, by less than `enough`: then no parameter is further than √(2 enough) standard deviations from
     the minimum.
     Raises `LostMotion` where the motion from the first trial cannot be followed.
     """
-    trial = residuals.evaluate(point)
-    anchor = Anchor(point.u, np.zeros_like(point.u)) if anchor is None else anchor
+    trial = begin if isinstance(begin, Trial) else residuals.evaluate(begin)
+    anchor = Anchor(trial.u, np.zeros_like(trial.u)) if anchor is None else anchor
     anchor = anchor.add_prior(residuals.parameters.prior_weights)
     done, blind = _descend(residuals, trial, law, enough, limit, anchor, 1, _TAKEN_BACK)
     if blind is None or residuals.log_likelihood(blind, residuals.noise_scale(blind, law)) <= (
@@ -197,8 +204,8 @@ def _find_better_trial(
             break
         trials += 1
         with contextlib.suppress(LostMotion):
-            trial = residuals.evaluate(Point(residuals.parameters.take_step(at.u, step.u), at.starts + step.starts))
-            fall = model.cost - model.cost_of(trial)
+            u = residuals.parameters.take_step(at.u, step.u)
+            trial, fall = model.evaluate(Point(u, at.starts + step.starts))
             if fall > 0.0 and len(blind) < takes_back and (seen & ~_find_seen(residuals, trial)).any():
                 blind.append(trial)
             elif fall > 0.0:
