@@ -22,7 +22,7 @@ from lagjax._native.series._lanes import emit, sincos_function
 from lagjax._program import OPERATIONS, Graph, StraightLine, eliminate_dead_code, operation_error
 
 _SET_ROWS = "set_rows"
-_MOST_ROOM = 2**16  # doubles of an interpreted line, half a megabyte of the stack of a thread
+_MOST_ROOM = 2**16  # doubles of an interpreted line in lanes, half a megabyte of the stack of a thread
 
 
 class LineCode:
@@ -251,7 +251,7 @@ class _RowWalk:
         found = [(k, at[line.outputs[k]]) for k in filled]
         values = np.array([line.nodes[i][2] for i in constants], float).view(np.int64)
         memories = 1 if moving is None else 2
-        self.lanes = lanes if memories * self.size * lanes <= _MOST_ROOM else 1
+        self.lanes = lanes if (memories * self.size + inputs + len(line.outputs)) * lanes <= _MOST_ROOM else 1
         self.room = 2 ** math.ceil(math.log2(memories * self.size * self.lanes))
         rows = np.array(rows, np.int64).reshape(-1, 5) * [1, *[self.lanes] * 4]
         counts, found = (len(rows), len(constants), len(found)), np.array(found, np.int64) * self.lanes
