@@ -216,6 +216,8 @@ class _FitSearch(NamedTuple):
         laws = [law for law in find_laws(self.params0) if law.law.selects]
         if laws and looks_further:
             descent, selection = select_terms(descent, self.law, laws, tell)
+        if tell and any(jumps(part.scene) for part in descent.residuals.parts):
+            tell("The search has ended: motion that sticks, or strikes, is followed at both ends of every interval.")
         return Fit.from_descent(descent, self.law, waterfall, selection)
 
     def search(
@@ -312,7 +314,8 @@ class _FitSearch(NamedTuple):
             scales = time_scales(list(reading.values()), part.motions, numbers)
         slower = scales.data / scales.scene if np.isfinite(scales.data) else 1.0
         possible = possible_mistakes(system.records, part.signals.names, left.worst, slower)
-        return find_mistake(share, possible, left.share, max(spent, SECONDS) if left.motion else spent)
+        tell = _print_line if self.progress else None
+        return find_mistake(share, possible, left.share, max(spent, SECONDS) if left.motion else spent, tell)
 
 
 def _keep_unused(residuals: Residuals, point: Point) -> tuple[Residuals, Point]:

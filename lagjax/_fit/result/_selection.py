@@ -379,6 +379,7 @@ class _PathSearch:
         if key not in self.scores:
             done = fit.done
             folds = min(len(done.residuals.records), _FOLDS)
+            self.tell(f"terms: {', '.join(key) or 'none'}; records are left out in {folds} groups")
             found = cross_validate(done.residuals, done.trial, done.noise, self.law, folds)[1]
             self.scores[key] = found
             self.tell(f"terms: {', '.join(key) or 'none'}; RMS {np.exp(np.mean(found)):.4g} of records left out")
