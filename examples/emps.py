@@ -13,8 +13,9 @@ follow as well as the best, within one standard error of the difference over tho
 
 An axis on rails remembers a force of 0.1 N as millimetres for ever after, and what the motor needs at one and the same
 speed drifts by 0.4 N within this record. A fit of all of it at once bends friction after the drift. So a law is fitted
-from rest to every third rest, about two seconds: the three thirds that were left out are then followed to 2.6 mm RMS,
-where a fit of whole spans gives 4.4. With friction that jumps at q̇ = 0 the sum of squares has a kink at every reversal,
+from rest to every third rest, about two seconds: the three thirds that were left out are then followed to 2.6 mm RMS
+by the best law that is written down, where a fit of whole spans gives 4.4, and to 1.7 mm by a free function of the
+speed (`lagjax.learned`). With friction that jumps at q̇ = 0 the sum of squares has a kink at every reversal,
 where searches creep; here the jump is spread over 2 mm/s.
 
 python examples/emps.py emps_identification.npz
@@ -55,7 +56,9 @@ LAWS = {
     "each way its own, square": ("viscous skew", "square"),
 }
 FREE = "a free function of the speed"
-SIZE = lagjax.learned.inertia((0.0, 0.14), count=7)  # of friction, positive; m/s
+# Of friction, positive: knots up to the fastest stroke [m/s]. The record has three speeds. From seven knots on a spline
+# wriggles between them, which follows strokes of these speeds to 0.3 mm, and others worse than any law.
+SIZE = lagjax.learned.inertia((0.0, 0.14), count=5)
 
 
 def forces(q, qdot, params, inputs):
