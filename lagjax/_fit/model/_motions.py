@@ -72,11 +72,11 @@ class AbstractMotions(abc.ABC):
     @abc.abstractmethod
     def follow(
         self, ts: np.ndarray, y0: np.ndarray, numbers: np.ndarray, y0_dot: np.ndarray, numbers_dot: np.ndarray,
-        table: SampleTable | None = None, known: RecordMotion | None = None,
+        table: SampleTable | None = None, known: Solution | None = None,
     ) -> RecordMotion:  # fmt: skip
         """The motions from `y0` (N, 2n) at `ts` (N, T), with parameters `numbers` (N, P) and a table of inputs a row.
 
-        Tangents go along `y0_dot` (N, D, 2n) and `numbers_dot` (N, D, P); without them these motions may be `known`.
+        Tangents go along `y0_dot` (N, D, 2n) and `numbers_dot` (N, D, P); their solution may be `known`.
         """
 
     @abc.abstractmethod
@@ -118,7 +118,7 @@ class _MachineCodeMotions(AbstractMotions):
 
     def follow(self, ts, y0, numbers, y0_dot, numbers_dot, table=None, known=None):
         flow, params = self._flow(numbers, table)
-        run = known.solution if known is not None else flow.run(ts, y0, params, self.tolerances)
+        run = known or flow.run(ts, y0, params, self.tolerances)
         if not y0_dot.shape[1] or not np.isin(run.result, ENDED_WELL).all():  # a lost motion needs no tangents
             none = np.zeros((len(y0), 0, *run.path.shape[1:]))
             return RecordMotion(run.path, none, run.result, run.t_end, run.y_end, run)

@@ -27,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import log_ndtr
 
+from lagjax._engine import Solution
 from lagjax._fit.model._blas import one_blas_thread
 from lagjax._fit.model._inputs import constant_tables, input_functions, inputs_at
 from lagjax._fit.model._motions import AbstractMotions, Manifold, Origins, RecordMotion
@@ -63,7 +64,7 @@ class Trial(NamedTuple):
     residuals: list[np.ndarray]
     slopes: list[np.ndarray]
     across: np.ndarray | None = None
-    motions: Sequence[RecordMotion] = ()
+    solutions: Sequence[Solution | None] = ()
 
     @property
     def point(self) -> Point:
@@ -81,15 +82,15 @@ class LostMotion(ValueError):
 class _SystemTrial(NamedTuple):
     """The unknowns of one system in a trial: the parameters (N, P) of its pieces and their directions (N, L, P), None
     without derivatives; the starts, how these move with the unknown states, (N, 2n, 2n) or None for the identity, and
-    with u, (N, L, 2n). `known` are motions that were followed without derivatives, `motions` all that are followed."""
+    with u, (N, L, 2n). `known` are solutions without derivatives, `solutions` those of all motions of the trial."""
 
     numbers: np.ndarray
     directions: np.ndarray | None
     starts: np.ndarray
     tangents: np.ndarray | None
     starts_dot: np.ndarray
-    known: Iterator[RecordMotion]
-    motions: list[RecordMotion]
+    known: Iterator[Solution | None]
+    solutions: list[Solution | None]
 
 
 class SystemFrame(NamedTuple):
@@ -183,10 +184,10 @@ class SystemResiduals:
     # ---- the trials of a search ----
 
     def append_residuals(
-        self, trial: Trial, numbers: np.ndarray, directions: np.ndarray | None, known: Iterator[RecordMotion]
+        self, trial: Trial, numbers: np.ndarray, directions: np.ndarray | None, known: Iterator[Solution | None]
     ) -> None:
         """Append the residuals of this system to a trial, whose starts move to where the motions begin, for parameters
-        `numbers` (N, P) of the pieces with `directions` (N, L, P), None without derivatives; motions may be `known`.
+        `numbers` (N, P) of the pieces with `directions` (N, L, P), None without derivatives; solutions may be `known`.
         Raises `LostMotion` for the first piece whose motion fails."""
         begun = self._begin_trial(trial, numbers, directions, known)
         for batch in self.batches:
@@ -213,7 +214,7 @@ class SystemResiduals:
         return LostMotion(f"The motion of {self.label(record)} from t = {begin:g} failed. {text}")
 
     def _begin_trial(
-        self, trial: Trial, numbers: np.ndarray, directions: np.ndarray | None, known: Iterator[RecordMotion]
+        self, trial: Trial, numbers: np.ndarray, directions: np.ndarray | None, known: Iterator[Solution | None]
     ) -> _SystemTrial:
         rows, states = self.frame.rows, self.states
         along = np.zeros((len(numbers), 0, numbers.shape[1])) if directions is None else directions
@@ -236,15 +237,15 @@ class SystemResiduals:
         if not np.all(finite):
             raise self.lost(np.argmin(np.all(finite, axis=0)), "A parameter is not finite.")
         trial.starts[rows, :states] = starts
-        motions = cast(list, trial.motions)
-        return _SystemTrial(numbers, directions, starts, tangents, starts_dot, known, motions)
+        solutions = cast(list, trial.solutions)
+        return _SystemTrial(numbers, directions, starts, tangents, starts_dot, known, solutions)
 
     def _follow(self, batch: Samples, ts: np.ndarray, trial: _SystemTrial) -> RecordMotion:
         """The motions of a trial at the times `ts` (N, T) of the pieces of a batch."""
         y0_dot, numbers_dot = self._directions(batch, trial)
         each = ts, trial.starts[batch.rows], trial.numbers[batch.rows], y0_dot, numbers_dot, batch.table
         motion = self.motions.follow(*each, next(trial.known, None))
-        trial.motions.append(motion._replace(tangents=np.zeros(0)))
+        trial.solutions.append(motion.solution)
         if not motion.ok:
             row, text = motion.describe_failure(ts, self.layout)
             raise self.lost(batch.rows[row], text)
@@ -455,7 +456,7 @@ class Residuals:
         trial = Trial(point.u, point.starts.copy(), [], [], across, [])
         numbers, directions = self.parameters.numbers(point.u), self.parameters.directions(point.u) if slopes else None
         watch, owners = self.watch or (lambda _: None), np.array([piece.record for piece in self.pieces])
-        known = iter(() if begun is None else begun.motions)
+        known = iter(() if begun is None else begun.solutions)
         try:
             for part in self.parts:
                 own = owners[part.frame.rows]
