@@ -135,23 +135,23 @@ def fit_servo(known: list[Recording]) -> lagjax.results.Fit:
     return lagjax.fit(arms, records, START, transforms=SETS, method="whole")
 
 
-def mean_error(params, one: Recording) -> float:
+def mean_error(errors: np.ndarray) -> float:
     """The mean absolute error [mrad] of a simulated recording."""
-    return 1e3 * float(np.mean(np.abs(one.errors(params))))
+    return 1e3 * float(np.mean(np.abs(errors)))
 
 
-def draw(known: list[Recording], params, file: Path):
+def draw(known: list[Recording], errors: list[np.ndarray], file: Path):
     """Every recording and its simulation."""
     rows = -(-len(known) // 2)
     figure, axes = plt.subplots(rows, 2, figsize=(9.0, 1.6 * rows), sharex=True, squeeze=False)
     for axis in axes.flat[len(known) :]:
         axis.set_visible(False)
-    for axis, one in zip(axes.flat, known, strict=False):
+    for axis, one, of_one in zip(axes.flat, known, errors, strict=False):
         axis.plot(one.t, one.goal, color="0.8", linewidth=1, label="goal")
         axis.plot(one.t, one.q, color="0.2", linewidth=2.5, label="measured")
-        axis.plot(one.t, one.q + one.errors(params), color="C1", linewidth=1.2, label="from its goal alone")
+        axis.plot(one.t, one.q + of_one, color="C1", linewidth=1.2, label="from its goal alone")
         axis.set_ylabel("angle [rad]")
-        axis.set_title(f"gain {one.gain / DUTY:g}: {mean_error(params, one):.0f} mrad", fontsize=9)
+        axis.set_title(f"gain {one.gain / DUTY:g}: {mean_error(of_one):.0f} mrad", fontsize=9)
     axes[0, 0].legend(fontsize=7)
     for axis in axes[-1]:
         axis.set_xlabel("time [s]")
@@ -174,8 +174,9 @@ def main(argv=None):
     for file, text in ((options.file, "fitted"), (options.follow, "followed")):
         if file is not None:
             other = recordings(file)
-            draw(other, fit.params, Path("out") / f"servo_{text}.png")
-            errors[text] = [mean_error(fit.params, one) for one in other]
+            found = [one.errors(fit.params) for one in other]
+            draw(other, found, Path("out") / f"servo_{text}.png")
+            errors[text] = [mean_error(of_one) for of_one in found]
             print(f"{text}: {len(other)} recordings, mean absolute error {np.mean(errors[text]):.1f} mrad")
     return fit, errors
 

@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._fit.model._assembly import GivenSystem, assemble_residuals, read_systems
+from lagjax._fit.model._blas import one_blas_thread
 from lagjax._fit.model._law_parameters import AbstractLaw, LawParameters, find_laws, terms
 from lagjax._fit.model._noise import AbstractNoise, Clipped, Gaussian, Quantised, StudentT
 from lagjax._fit.model._parameters import Parameters, per_record
@@ -47,7 +48,7 @@ from lagjax._fit.search._descent import Descent
 from lagjax._fit.search._multistart import Waterfall, run_multistart
 from lagjax._fit.search._reader import TimeScales, first_starts, read_records, time_scales
 from lagjax._fit.search._search import Search, search_again
-from lagjax._fit.search._unexplained import Unexplained
+from lagjax._fit.search._unexplained import Unexplained, measure_unexplained
 from lagjax._primitives import with_doubles
 from lagjax._run.hybrid import Scene, jumps
 from lagjax._scene import HOLDS
@@ -63,6 +64,7 @@ _STARTS_AT_A_TIME, _TIMES = 16, 4
 
 
 @with_doubles
+@one_blas_thread()
 def fit(
     system: Scene | dict[str, Scene],
     records: Record | Timings | list | dict[str, Any],
@@ -208,6 +210,20 @@ class _FitSearch(NamedTuple):
         Motion that sticks, or strikes, has many minima: with `looks_further` more starts are tried where one leaves
         motion, and candidate terms are chosen.
         """
+        descent, waterfall = self.search(given, looks_further)
+        tell, selection = _print_line if self.progress else None, None
+        descent = find_smoothness(descent, self.law, tell)
+        laws = [law for law in find_laws(self.params0) if law.law.selects]
+        if laws and looks_further:
+            descent, selection = select_terms(descent, self.law, laws, tell)
+        if tell and any(jumps(part.scene) for part in descent.residuals.parts):
+            tell("The search has ended: motion that sticks, or strikes, is followed at both ends of every interval.")
+        return Fit.from_descent(descent, self.law, waterfall, selection)
+
+    def search(
+        self, given: list[GivenSystem], looks_further: bool = False, rough: bool = False
+    ) -> tuple[Descent, Waterfall | None]:
+        """The end of the search of records, of all terms and with a weak prior of learned functions."""
         parameters = self.build(sum(len(one.records) for one in given))
         residuals = assemble_residuals(given, parameters, self.law)
         self._require_one_beginning(residuals)
@@ -218,19 +234,14 @@ class _FitSearch(NamedTuple):
         residuals = begin_weakly(residuals, point, self.law)
         if self.progress:
             residuals.watch = _print_trials(residuals.size)
-        search = Search(residuals, self.law, self.method, readers)
+        search = Search(residuals, self.law, self.method, readers, rough)
         if self.method == "gradient":
             descent = search.descend_gradient(point)
         else:
             descent, waterfall = self._descend(residuals, search, point, looks_further)
             descent = search_again(descent, self.law)
         residuals.watch = descent.residuals.watch = None
-        descent = find_smoothness(descent, self.law, _print_line if self.progress else None)
-        laws, selection = [law for law in find_laws(self.params0) if law.law.selects], None
-        if laws and looks_further:
-            tell = _print_line if self.progress else None
-            descent, selection = select_terms(descent, self.law, laws, tell)
-        return Fit.from_descent(descent, self.law, waterfall, selection)
+        return descent, waterfall
 
     def _descend(
         self, residuals: Residuals, search: Search, point: Point, looks_further: bool
@@ -291,7 +302,7 @@ class _FitSearch(NamedTuple):
 
         def share(records: list[Any]) -> float | None:
             try:
-                _, left = once.fit([system._replace(records=records)])
+                left = measure_unexplained(once.search([system._replace(records=records)], rough=True)[0])
             except ValueError:
                 return None
             return None if left.motion else left.share
@@ -303,7 +314,8 @@ class _FitSearch(NamedTuple):
             scales = time_scales(list(reading.values()), part.motions, numbers)
         slower = scales.data / scales.scene if np.isfinite(scales.data) else 1.0
         possible = possible_mistakes(system.records, part.signals.names, left.worst, slower)
-        return find_mistake(share, possible, left.share, max(spent, SECONDS) if left.motion else spent)
+        tell = _print_line if self.progress else None
+        return find_mistake(share, possible, left.share, max(spent, SECONDS) if left.motion else spent, tell)
 
 
 def _keep_unused(residuals: Residuals, point: Point) -> tuple[Residuals, Point]:

@@ -79,7 +79,7 @@ def test_a_long_line_is_what_its_operations_are():
     program, rows = lower(steps, np.zeros(20)), np.random.default_rng(0).normal(size=(21, 20))
     expected = program.line.evaluate(list(rows.T)).T
     assert len(program.line.nodes) > 1700
-    for made in ({}, {"largest": 20_000}, {"largest": 20_000, "lanes": 8}):
+    for made in ({}, {"lanes": 8}, {"largest": 20_000}, {"largest": 20_000, "lanes": 8}):
         code = LineCode(program.line, 20, **made)
         for count in (1, 8, 21):
             np.testing.assert_allclose(code(rows[:count]), expected[:count], rtol=1e-13, atol=1e-13)

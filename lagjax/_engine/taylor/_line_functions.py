@@ -47,7 +47,8 @@ from lagjax._tracing import Program, emit, lower, lowers
 _TARGET = "lagjax_line"
 # Machine code takes some 20 µs a node to make, and NumPy 1 µs a node for a call: that of a line which XLA does not wait
 # for is made after as many calls as take that long, so that one call is not slow, and a thousand are not.
-_CALLS = 20
+# A long one is interpreted: it takes 2 µs a node to make, and of 80 rows a fortieth of what NumPy takes.
+_CALLS, _LONG_CALLS = 20, 3
 # What LLVM may take for a line of a program of XLA, in additions, which take 70 µs each, beyond 12 000 of them 40.
 # Behind 4200 of them a call takes 0.5 µs in place of 13; behind 39 000 a row of many 6 in place of 100.
 WORK_OF_JIT = 60_000
@@ -159,7 +160,7 @@ class Line:
 
     @functools.cached_property
     def code(self) -> LineCode | None:
-        return self._make_code()
+        return self._make_code(lanes=1 if len(self.line.nodes) <= LARGEST_LINE else LANES)
 
     @functools.lru_cache(maxsize=2)  # noqa: B019  # those of a few
     def code_of_jit(self, is_wide: bool, shared: tuple[int, ...] = ()) -> LineCode | None:
@@ -179,13 +180,13 @@ class Line:
             return None
 
     def evaluate(self, *parts: np.ndarray) -> np.ndarray:
-        """Outputs (…, outputs) at inputs in parts (…, some): by NumPy until machine code would have been cheaper."""
+        """Outputs (…, outputs) at inputs in parts (…, some): by NumPy until machine code would have been cheaper, which
+        interprets a long line."""
         batch = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
         parts = tuple(np.broadcast_to(part, (*batch, part.shape[-1])) for part in parts)
         rows = np.concatenate([part.reshape(math.prod(batch), part.shape[-1]) for part in parts], axis=1)
         self._calls += 1
-        is_short = len(self.line.nodes) <= LARGEST_LINE
-        code = self.code if is_short and self._calls >= _CALLS else None
+        code = self.code if self._calls >= (_CALLS if len(self.line.nodes) <= LARGEST_LINE else _LONG_CALLS) else None
         found = self.line.evaluate(list(rows.T)).T if code is None else code(rows)
         return found.reshape(*batch, self.outputs + self.memo)
 

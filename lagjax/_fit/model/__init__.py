@@ -6,5 +6,5 @@ numbers, `_transforms` keep them in a set, `_law_parameters` are those of functi
 `_motions` follows the scene, `_signals` says what its sensors show (`_sensors`: delays, whole turns). `_residuals`
 joins all that to the residuals of one trial; `_noise` is the law of their scatter, `_autocorrelation` what correlated
 ones are worth, `_density` the posterior density that follows. `_assembly` makes the residuals out of what the user
-gives.
+gives; `_blas` keeps their linear algebra on one thread.
 """

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._engine import Problem, choose
+from lagjax._engine import Problem, Solution, choose
 from lagjax._engine.taylor import Flow, MachineCode, Motions, flow_of, jvp, project_start_tangents, tolerances_of
 from lagjax._fit.model._inputs import InputForm, SampleTable, constant_tables, input_functions
 from lagjax._fit.model._parameters import Parameters
@@ -39,13 +39,15 @@ PyTree = Any
 
 
 class RecordMotion(NamedTuple):
-    """N motions: `path` (N, T, 2n), `tangents` (N, D, T, 2n), and how each ended: `result`, `t_end` (N,), `y_end`."""
+    """N motions: `path` (N, T, 2n), `tangents` (N, D, T, 2n), and how each ended: `result`, `t_end` (N,), `y_end`; and
+    the solution of an engine that can add tangents later."""
 
     path: np.ndarray
     tangents: np.ndarray
     result: np.ndarray
     t_end: np.ndarray
     y_end: np.ndarray
+    solution: Solution | None = None
 
     @property
     def ok(self) -> bool:
@@ -61,18 +63,20 @@ class RecordMotion(NamedTuple):
 
 
 class AbstractMotions(abc.ABC):
-    """Followers of motions and their tangents; `projection` puts states on the constraints by machine code."""
+    """Followers of motions and their tangents; `projection` puts states on the constraints by machine code. `splits`:
+    motions without tangents cost less, and need no other program."""
 
     projection: Projection | None = None
+    splits = False
 
     @abc.abstractmethod
     def follow(
         self, ts: np.ndarray, y0: np.ndarray, numbers: np.ndarray, y0_dot: np.ndarray, numbers_dot: np.ndarray,
-        table: SampleTable | None = None,
+        table: SampleTable | None = None, known: Solution | None = None,
     ) -> RecordMotion:  # fmt: skip
         """The motions from `y0` (N, 2n) at `ts` (N, T), with parameters `numbers` (N, P) and a table of inputs a row.
 
-        Tangents go along `y0_dot` (N, D, 2n) and `numbers_dot` (N, D, P).
+        Tangents go along `y0_dot` (N, D, 2n) and `numbers_dot` (N, D, P); their solution may be `known`.
         """
 
     @abc.abstractmethod
@@ -99,6 +103,8 @@ def choose_motions(
 
 
 class _MachineCodeMotions(AbstractMotions):
+    splits = True
+
     def __init__(self, problem: Callable[[int], Problem], is_driven: bool):
         """`problem(room)` is about the scene with tables of inputs of this many instants."""
         self.problem, self.tolerances, self.is_driven = problem, tolerances_of(problem(2)), is_driven
@@ -110,16 +116,16 @@ class _MachineCodeMotions(AbstractMotions):
             return flow_of(self.problem(2)), numbers
         return flow_of(self.problem(table.room)), table.rows(numbers)
 
-    def follow(self, ts, y0, numbers, y0_dot, numbers_dot, table=None):
+    def follow(self, ts, y0, numbers, y0_dot, numbers_dot, table=None, known=None):
         flow, params = self._flow(numbers, table)
-        run = flow.run(ts, y0, params, self.tolerances)
+        run = known or flow.run(ts, y0, params, self.tolerances)
         if not y0_dot.shape[1] or not np.isin(run.result, ENDED_WELL).all():  # a lost motion needs no tangents
             none = np.zeros((len(y0), 0, *run.path.shape[1:]))
-            return RecordMotion(run.path, none, run.result, run.t_end, run.y_end)
+            return RecordMotion(run.path, none, run.result, run.t_end, run.y_end, run)
         params_dot = np.zeros((*y0_dot.shape[:2], params.shape[1]))
         params_dot[..., : numbers.shape[-1]] = numbers_dot
         tangents, _ = jvp(flow, Motions.from_solution(ts, y0, params, run), y0_dot, params_dot, self.tolerances)
-        return RecordMotion(run.path, tangents, run.result, run.t_end, run.y_end)
+        return RecordMotion(run.path, tangents, run.result, run.t_end, run.y_end, run)
 
     def rate(self, t, y, numbers, table=None):
         flow, params = self._flow(numbers, table)
@@ -143,7 +149,7 @@ class _JaxMotions(AbstractMotions):
             self._follow, self._rate = _programs_once.__wrapped__(*key)
         self.dtype = layout.dtype
 
-    def follow(self, ts, y0, numbers, y0_dot, numbers_dot, table=None):
+    def follow(self, ts, y0, numbers, y0_dot, numbers_dot, table=None, known=None):
         arrays = jax.tree.map(self._array, (ts, y0, numbers, y0_dot, numbers_dot, table))
         (path, result, t_end, y_end), tangents = jax.tree.map(np.asarray, self._follow(*arrays))
         return RecordMotion(path.astype(float), tangents.astype(float), result, t_end, y_end)

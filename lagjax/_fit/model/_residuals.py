@@ -18,15 +18,17 @@ densities have their gradients: back over the steps of motions, where trials go 
 import copy
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.special import log_ndtr
 
+from lagjax._engine import Solution
+from lagjax._fit.model._blas import one_blas_thread
 from lagjax._fit.model._inputs import constant_tables, input_functions, inputs_at
 from lagjax._fit.model._motions import AbstractMotions, Manifold, Origins, RecordMotion
 from lagjax._fit.model._noise import AbstractNoise, NoiseScale, Sensor, counts, log_likelihood, scores, worths
@@ -50,7 +52,8 @@ class Point(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """One trial: the unknowns, and for each batch the residuals (N, T, S) and their derivatives (N, T, S, D).
+    """One trial: the unknowns, and for each batch the residuals (N, T, S) and their derivatives (N, T, S, D), which may
+    be left out.
 
     Where starts lie on constraints `across` (N, 2n, 2n) takes a change of each to its part across these, which changes
     nothing that is measured.
@@ -61,6 +64,7 @@ class Trial(NamedTuple):
     residuals: list[np.ndarray]
     slopes: list[np.ndarray]
     across: np.ndarray | None = None
+    solutions: Sequence[Solution | None] = ()
 
     @property
     def point(self) -> Point:
@@ -76,14 +80,17 @@ class LostMotion(ValueError):
 
 
 class _SystemTrial(NamedTuple):
-    """The unknowns of one system in a trial: the parameters (N, P) of its pieces and their directions (N, L, P), the
-    starts, how these move with the unknown states, (N, 2n, 2n) or None for the identity, and with u, (N, L, 2n)."""
+    """The unknowns of one system in a trial: the parameters (N, P) of its pieces and their directions (N, L, P), None
+    without derivatives; the starts, how these move with the unknown states, (N, 2n, 2n) or None for the identity, and
+    with u, (N, L, 2n). `known` are solutions without derivatives, `solutions` those of all motions of the trial."""
 
     numbers: np.ndarray
-    directions: np.ndarray
+    directions: np.ndarray | None
     starts: np.ndarray
     tangents: np.ndarray | None
     starts_dot: np.ndarray
+    known: Iterator[Solution | None]
+    solutions: list[Solution | None]
 
 
 class SystemFrame(NamedTuple):
@@ -176,11 +183,13 @@ class SystemResiduals:
 
     # ---- the trials of a search ----
 
-    def append_residuals(self, trial: Trial, numbers: np.ndarray, directions: np.ndarray) -> None:
+    def append_residuals(
+        self, trial: Trial, numbers: np.ndarray, directions: np.ndarray | None, known: Iterator[Solution | None]
+    ) -> None:
         """Append the residuals of this system to a trial, whose starts move to where the motions begin, for parameters
-        `numbers` (N, P) of the pieces with `directions` (N, L, P). Raises `LostMotion` for the first piece whose motion
-        fails."""
-        begun = self._begin_trial(trial, numbers, directions)
+        `numbers` (N, P) of the pieces with `directions` (N, L, P), None without derivatives; solutions may be `known`.
+        Raises `LostMotion` for the first piece whose motion fails."""
+        begun = self._begin_trial(trial, numbers, directions, known)
         for batch in self.batches:
             clock = self.clocks.get(self.pieces[batch.rows[0]].record)
             if clock is not None:
@@ -191,7 +200,9 @@ class SystemResiduals:
                 motion, numbers_dot = self._follow(batch, batch.ts, begun), self._directions(batch, begun)[1]
                 shown = self.signals.evaluate(motion, batch.ts, batch.inputs, begun.numbers[batch.rows], numbers_dot)
             self._require_finite(batch, *shown)
-            self._append_batch(batch, trial, *shown)
+            self._append_residuals(batch, trial, shown[0])
+            if directions is not None:
+                self._append_slopes(batch, trial, shown[1])
 
     def label(self, record: int) -> str:
         """The name by which the user reaches a record of this system: `records[0]`, or `records['name'][0]`."""
@@ -202,9 +213,12 @@ class SystemResiduals:
         begin = self.records[record].ts[places[0]]
         return LostMotion(f"The motion of {self.label(record)} from t = {begin:g} failed. {text}")
 
-    def _begin_trial(self, trial: Trial, numbers: np.ndarray, directions: np.ndarray) -> _SystemTrial:
+    def _begin_trial(
+        self, trial: Trial, numbers: np.ndarray, directions: np.ndarray | None, known: Iterator[Solution | None]
+    ) -> _SystemTrial:
         rows, states = self.frame.rows, self.states
-        starts, starts_dot = self.origins.move(trial.starts[rows, :states], numbers, directions)
+        along = np.zeros((len(numbers), 0, numbers.shape[1])) if directions is None else directions
+        starts, starts_dot = self.origins.move(trial.starts[rows, :states], numbers, along)
         tangents = None
         if self.fits_on_constraints:
             assert self.manifold is not None and trial.across is not None
@@ -213,23 +227,25 @@ class SystemResiduals:
             inputs = np.zeros((len(starts), self.batches[0].inputs.shape[-1]))
             for batch in self.batches:
                 inputs[batch.rows] = batch.inputs[:, 0]
-            each = (x[some] for x in (starts, t, numbers, directions, inputs))
+            each = (x[some] for x in (starts, t, numbers, along, inputs))
             consistent = self.manifold.project(*each)
             starts[some], tangents[some], starts_dot[some] = consistent
             if (lost := ~np.isfinite(starts).all(axis=1)).any():
                 raise self.lost(np.argmax(lost), "No start near the one that was tried satisfies the constraints.")
             trial.across[rows, :states, :states] = np.eye(states) - tangents
-        finite = [np.isfinite(x).reshape(len(starts), -1).all(axis=1) for x in (numbers, directions, starts)]
+        finite = [np.isfinite(x).all(axis=tuple(range(1, x.ndim))) for x in (numbers, along, starts)]
         if not np.all(finite):
             raise self.lost(np.argmin(np.all(finite, axis=0)), "A parameter is not finite.")
         trial.starts[rows, :states] = starts
-        return _SystemTrial(numbers, directions, starts, tangents, starts_dot)
+        solutions = cast(list, trial.solutions)
+        return _SystemTrial(numbers, directions, starts, tangents, starts_dot, known, solutions)
 
     def _follow(self, batch: Samples, ts: np.ndarray, trial: _SystemTrial) -> RecordMotion:
         """The motions of a trial at the times `ts` (N, T) of the pieces of a batch."""
         y0_dot, numbers_dot = self._directions(batch, trial)
-        rows = batch.rows
-        motion = self.motions.follow(ts, trial.starts[rows], trial.numbers[rows], y0_dot, numbers_dot, batch.table)
+        each = ts, trial.starts[batch.rows], trial.numbers[batch.rows], y0_dot, numbers_dot, batch.table
+        motion = self.motions.follow(*each, next(trial.known, None))
+        trial.solutions.append(motion.solution)
         if not motion.ok:
             row, text = motion.describe_failure(ts, self.layout)
             raise self.lost(batch.rows[row], text)
@@ -237,7 +253,9 @@ class SystemResiduals:
 
     def _directions(self, batch: Samples, trial: _SystemTrial) -> tuple[np.ndarray, np.ndarray]:
         """Directions of the starts (N, D, 2n) and of the parameters (N, D, P): D = 2n + L, or L where no start is
-        free."""
+        free, or 0 without derivatives."""
+        if trial.directions is None:
+            return np.zeros((len(batch.rows), 0, self.states)), trial.numbers[batch.rows, None][:, :0]
         directions, states = trial.directions[batch.rows], self.states if self.fitted[batch.rows].any() else 0
         y0_dot = np.zeros((len(batch.rows), states + directions.shape[1], self.states))
         y0_dot[:, :states] = np.eye(states, self.states)
@@ -296,16 +314,20 @@ class SystemResiduals:
             raise self.lost(batch.rows[0], "The derivatives of its crossing times are not finite.")
         return times[None, :, None], slopes[None, :, None]
 
-    def _append_batch(self, batch: Samples, trial: Trial, values: np.ndarray, by_unknowns: np.ndarray) -> None:
+    def _append_residuals(self, batch: Samples, trial: Trial, values: np.ndarray) -> None:
+        counted, shown = batch.weights > 0, np.zeros(batch.weights.shape)
+        shown[..., self.columns(self.pieces[batch.rows[0]].record)] = values
+        trial.residuals.append(np.where(counted, wrap_residuals(shown - batch.values, self.frame.periods), 0.0))
+
+    def _append_slopes(self, batch: Samples, trial: Trial, by_unknowns: np.ndarray) -> None:
         counted, columns = batch.weights > 0, self.columns(self.pieces[batch.rows[0]].record)
         states = self.states if self.fitted[batch.rows].any() else 0
-        free = by_unknowns.shape[-1] - states
-        shown, slopes = np.zeros(counted.shape), np.zeros((*counted.shape, self.frame.states + free))
-        shown[..., columns], slopes[..., columns, self.frame.states :] = values, by_unknowns[..., states:]
+        slopes = np.zeros((*counted.shape, self.frame.states + by_unknowns.shape[-1] - states))
+        slopes[..., columns, self.frame.states :] = by_unknowns[..., states:]
         fitted = self.fitted[batch.rows, None, None, None]
         slopes[..., columns, :states] = np.where(fitted, by_unknowns[..., :states], 0.0)
-        trial.residuals.append(np.where(counted, wrap_residuals(shown - batch.values, self.frame.periods), 0.0))
-        trial.slopes.append(np.where(counted[..., None], slopes, 0.0))
+        slopes[~counted] = 0.0
+        trial.slopes.append(slopes)
 
     # ---- the same for JAX ----
 
@@ -421,22 +443,48 @@ class Residuals:
 
     # ---- trials ----
 
-    def evaluate(self, point: Point) -> Trial:
-        """The residuals at one point. Raises `LostMotion` for the first piece whose motion fails."""
+    def evaluate(self, point: Point, slopes: bool = True, begun: Trial | None = None) -> Trial:
+        """The residuals at one point. Raises `LostMotion` for the first piece whose motion fails.
+
+        Without `slopes` derivatives are left out where motions cost less so; `begun` is such a trial at this point.
+        """
+        if begun is not None and begun.slopes:
+            return begun
+        slopes |= not all(part.motions.splits and not part.clocks for part in self.parts)
         constrained, square = any(part.fits_on_constraints for part in self.parts), (self.states, self.states)
         across = np.zeros((len(point.starts), *square)) if constrained else None
-        trial = Trial(point.u, point.starts.copy(), [], [], across)
-        numbers, directions = self.parameters.numbers(point.u), self.parameters.directions(point.u)
+        trial = Trial(point.u, point.starts.copy(), [], [], across, [])
+        numbers, directions = self.parameters.numbers(point.u), self.parameters.directions(point.u) if slopes else None
         watch, owners = self.watch or (lambda _: None), np.array([piece.record for piece in self.pieces])
+        known = iter(() if begun is None else begun.solutions)
         try:
             for part in self.parts:
                 own = owners[part.frame.rows]
-                part.append_residuals(trial, numbers[self.parameters.places[own]], directions[own])
+                along = None if directions is None else directions[own]
+                part.append_residuals(trial, numbers[self.parameters.places[own]], along, known)
         except LostMotion as reason:
             watch(reason)
             raise
-        watch(trial)
+        if begun is None:
+            watch(trial)
         return trial
+
+    def select(self, keep: np.ndarray, trial: Trial) -> "tuple[Residuals, Point | Trial]":
+        """The residuals of some of the pieces, a mask (N,), and what a trial says of them."""
+        kept = [piece for piece, stays in zip(self.pieces, keep, strict=True) if stays]
+        part, rows = self.with_pieces(kept, self.fitted[keep]), np.flatnonzero(keep)
+        part.watch = None
+        if part.names != self.names:
+            return part, Point(trial.u, trial.starts[keep])
+        places = {row: (b, k) for b, batch in enumerate(self.batches) for k, row in enumerate(batch.rows)}
+        found = Trial(trial.u, trial.starts[keep], [], [], None if trial.across is None else trial.across[keep])
+        for batch in part.batches:
+            for each, some in ((trial.residuals, found.residuals), (trial.slopes, found.slopes)):
+                some.append(np.zeros((*batch.ts.shape, *each[0].shape[2:])))
+                for own, (b, k) in zip(some[-1], (places[row] for row in rows[batch.rows]), strict=True):
+                    count = min(len(own), len(each[b][k]))
+                    own[:count] = each[b][k][:count]
+        return part, found
 
     def trace_starts(self, starts, u):
         """The starts (N, 2n) for JAX, where those that are functions of the parameters follow u (F,)."""
@@ -586,24 +634,20 @@ class Residuals:
         return {part.name: tuple(values[part.frame.records]) for part in self.parts}
 
 
+@one_blas_thread()
 def qr_triangle(rows: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
-_BLOCK = 8  # times as many rows as columns in one factorisation, and twice as many at least
-# Numbers in one factorisation, for which OpenBLAS takes one thread (up to 9216). Of twice as many, of 64 columns, its
-# threads wait for each other: 50 times the processor time on a busy machine.
-_BLOCK_NUMBERS = 8192
+_BLOCK = 8  # times as many rows as columns in one factorisation
 
 
 def compress_rows(rows: np.ndarray) -> np.ndarray:
-    """The triangles (N, D, D) of N tall matrices (N, M, D), block by block. Blocks stay in the cache, and are too small
-    for a BLAS to start threads that wait for each other."""
+    """The triangles (N, D, D) of N tall matrices (N, M, D), block by block: blocks stay in the cache."""
     pieces, _, columns = rows.shape
     rows = rows if columns else rows[:, :0]
     while rows.shape[1] > columns:
-        height = max(2 * columns, min(_BLOCK * columns, _BLOCK_NUMBERS // columns))
-        height = min(height, rows.shape[1])
+        height = min(_BLOCK * columns, rows.shape[1])
         if missing := -rows.shape[1] % height:
             rows = np.concatenate([rows, np.zeros((pieces, missing, columns))], axis=1)
         rows = qr_triangle(rows.reshape(-1, height, columns)).reshape(pieces, -1, columns)

@@ -61,11 +61,9 @@ def comparison(fits: dict[str, Any], folds: int) -> Comparison:
     margin = np.partition(np.array(bic), 1)[1] - min(bic)
     said = [f"The data prefer {_fit_label(names[best])} fit, by {margin:.1f} in BIC ({count:.0f} effective samples)."]
     if folds:
-        every = (fit.residual_function for fit in fits.values())
-        pairs = zip(every, fits.values(), strict=True)
-        left, scores = zip(
-            *(cross_validate(r, Point(f.u, f.states), f.noise_scale, f.law, folds) for r, f in pairs), strict=True
-        )
+        ends = [(f, f.residual_function.evaluate(Point(f.u, f.states))) for f in fits.values()]
+        found = [cross_validate(f.residual_function, end, f.noise_scale, f.law, folds) for f, end in ends]
+        left, scores = zip(*found, strict=True)
         simplest = _fit_label(names[best := choose_simplest(free, np.array(scores))])
         said.append(f"Left out in {folds} groups, no record is followed better than by {simplest} fit, but for chance.")
     rows = [*_table(names, free, logs, aic, bic, left), *said]
@@ -100,7 +98,7 @@ def _table(names, free, logs, aic, bic, left) -> list[str]:
 
 
 def cross_validate(
-    residuals: Residuals, fitted: Point, noise: NoiseScale, law: AbstractNoise, folds: int
+    residuals: Residuals, fitted: Trial, noise: NoiseScale, law: AbstractNoise, folds: int
 ) -> tuple[dict[str, float], np.ndarray]:
     """RMS residuals by signal of records left out, and for each record their mean logarithm; all infinite where one
     cannot be followed. A signal that only these have is as noisy as in the fit of all."""
@@ -108,8 +106,7 @@ def cross_validate(
     squares, weights = dict.fromkeys(residuals.names, 0.0), dict.fromkeys(residuals.names, 0.0)
     groups = owners % folds
     for group in range(folds):
-        rest, apart = (_select_pieces(residuals, keep) for keep in (groups != group, groups == group))
-        begin, left_out = Point(fitted.u, fitted.starts[groups != group]), fitted.starts[groups == group]
+        (rest, begin), (apart, _) = (residuals.select(keep, fitted) for keep in (groups != group, groups == group))
         known = dict(zip(residuals.names, zip(*noise, strict=True), strict=True))
         try:
             done = minimise(rest, begin, law, _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
@@ -117,7 +114,7 @@ def cross_validate(
             sensed = KnownNoise(NoiseScale(*np.array([known[name] for name in apart.names]).T))
             kept = np.isin(np.arange(len(fitted.u)), residuals.unknowns.shared)
             apart = apart.with_parameters(residuals.parameters.fix(done.trial.u, kept))
-            point = Point(done.trial.u[~kept], left_out)
+            point = Point(done.trial.u[~kept], fitted.starts[groups == group])
             end = minimise(apart, point, sensed, _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
         except LostMotion:
             return dict.fromkeys(residuals.names, np.inf), np.full(len(scores), np.inf)
@@ -140,12 +137,6 @@ def _sum_squares(residuals: Residuals, trial: Trial) -> dict[int, np.ndarray]:
             record = residuals.pieces[row].record
             found[record] = found.get(record, 0.0) + sums
     return found
-
-
-def _select_pieces(residuals: Residuals, keep: np.ndarray) -> Residuals:
-    part = residuals.with_pieces([p for p, k in zip(residuals.pieces, keep, strict=True) if k], residuals.fitted[keep])
-    part.watch = None
-    return part
 
 
 def _require_same_records(first, others) -> None:

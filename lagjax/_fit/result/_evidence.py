@@ -75,14 +75,14 @@ def find_smoothness(done: Descent, law: AbstractNoise, tell: Callable[[str], Non
         pace *= 0.5 if any(moves[name] * last.get(name, 0.0) < 0.0 for name in moves) else 1.0
         strengths, last = {name: before[name] * math.exp(pace * moves[name]) for name in before}, moves
         residuals = done.residuals.with_parameters(done.residuals.parameters.replace_strengths(strengths))
-        done = minimise(residuals, done.trial.point, law, _ENOUGH_OF_ROUND * residuals.measured, _TRIALS)
+        done = minimise(residuals, done.trial, law, _ENOUGH_OF_ROUND * residuals.measured, _TRIALS)
         trials += done.trials
         if tell is not None:
             tell(", ".join(f"{name}: strength {value:.3g}" for name, value in strengths.items()))
         if max(map(abs, moves.values())) < _SAME:
             text = ""
             break
-    done = minimise(done.residuals, done.trial.point, law, _ENOUGH, _TRIALS)
+    done = minimise(done.residuals, done.trial, law, _ENOUGH, _TRIALS)
     square = _data_square(done.residuals, done.trial, done.noise)
     covariance = _covariance(square, done.residuals.parameters.prior_weights**2)
     said = [text] * bool(text) + [_sentence(covariance, part) for part in smooth_parts(done.residuals.parameters)]

@@ -179,7 +179,7 @@ def null_space(
     """Directions of u (F, K) that nothing depends on, the starts being free, and on which no prior of weights (F,) has
     an opinion; and a basis (F, F − K) of the others."""
     rows, unit = parameter_rows(triangles, states, unknowns), _lengths(triangles, states, unknowns)
-    rows = np.concatenate([rows, np.diag(prior)])
+    rows = np.concatenate([rows, np.diag(np.minimum(prior, unit))])  # else a strong one would hide what data say
     if not len(unit):
         return np.zeros((0, 0)), np.zeros((0, 0))
     # From above zero by its own round-off, so that a column which is noise alone counts as nothing.

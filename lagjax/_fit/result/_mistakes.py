@@ -75,12 +75,15 @@ def possible_mistakes(
 
 
 def find_mistake(
-    share: Callable[[list[Any]], float | None], possible: Iterable[PossibleMistake], left: float, seconds: float
-) -> list[str]:
+    share: Callable[[list[Any]], float | None], possible: Iterable[PossibleMistake], left: float, seconds: float,
+    tell: Callable[[str], None] | None = None,
+) -> list[str]:  # fmt: skip
     """A sentence for the first mistake whose removal lets a fit follow the records; `share(records)` is what a fit
-    leaves of the signals, None where it fails, and `left` what the given fit left."""
+    leaves of the signals, None where it fails, and `left` what the given fit left. `tell` prints a line for each."""
     until = time.process_time() + seconds
     for suspect in possible:
+        if tell:
+            tell(f"Motion is left, perhaps by a mistake in the records: they are fitted {suspect.text}.")
         now = share(suspect.records)
         if now is not None and now < _BETTER * left:
             before = "failed" if np.isinf(left) else f"leaves {100 * left:.2g} % of them"

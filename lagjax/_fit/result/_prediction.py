@@ -98,7 +98,9 @@ def predict_record(fit, record: Record, system: str | None) -> Prediction:
     moves = np.isin(np.arange(len(about.u)), about.own)
     residuals, point = Residuals([fixed], about.parameters.fix(about.u, ~moves)), Point(about.u[moves], state[None])
     done = is_fitted or moves.any()
-    trial = minimise(residuals, point, KnownNoise(noise), 1e-3).trial if done else residuals.evaluate(point)
+    trial = (
+        minimise(residuals, point, KnownNoise(noise), 1e-3).trial if done else residuals.evaluate(point, slopes=False)
+    )
     state, about.u[moves] = trial.starts[0], trial.u
     start = layout.restore(state[:n]), layout.restore(state[n:])
     q0, qdot0, ts = jax.tree.map(lambda x: np.asarray(x, layout.dtype), (*start, record.ts))

@@ -36,7 +36,7 @@ from lagjax._equations import decide
 from lagjax._fit.model._law_parameters import FoundLaw
 from lagjax._fit.model._noise import AbstractNoise
 from lagjax._fit.model._parameters import Parameters
-from lagjax._fit.model._residuals import LostMotion, Point, Residuals, qr_triangle
+from lagjax._fit.model._residuals import LostMotion, Point, Residuals, Trial, qr_triangle
 from lagjax._fit.result._comparison import choose_simplest, cross_validate
 from lagjax._fit.result._information import Information, information, parameter_rows
 from lagjax._fit.search._descent import Descent, column_norms, eliminate, minimise
@@ -245,9 +245,9 @@ class _TermFit(NamedTuple):
             found[same[-1]] = same[:-1]
         return found
 
-    def hold_idle(self, whole: "_TermFit") -> tuple[Residuals, Point, list[str]]:
-        """The residuals and the point of this fit where the numbers that nothing depends on, but did in the fit with
-        the `whole` law, stay at their guess; and the labels of these."""
+    def hold_idle(self, whole: "_TermFit") -> tuple[Residuals, Point | Trial, list[str]]:
+        """The residuals and the point, or the trial, of this fit where the numbers that nothing depends on, but did in
+        the fit with the `whole` law, stay at their guess; and the labels of these."""
         unread = []
         for fit in (self, whole):
             residuals = fit.done.residuals
@@ -257,7 +257,7 @@ class _TermFit(NamedTuple):
         residuals, trial, first = self.done.residuals, self.done.trial, whole.done.residuals.parameters
         labels = sorted(unread[0] - unread[1])
         if not labels:
-            return residuals, trial.point, labels
+            return residuals, trial, labels
         stays, u = _mark_unknowns(residuals.parameters, labels), trial.u.copy()
         u[stays] = first.inverse(first.first)[_mark_unknowns(first, labels)]
         residuals = residuals.with_parameters(residuals.parameters.fix(u, stays))
@@ -276,12 +276,13 @@ class _TermFit(NamedTuple):
         residuals, begun = residuals.with_parameters(parameters.zero(trial.u, stays)), []
         for point in (Point(u[~stays], trial.starts + step.starts), Point(trial.u[~stays], trial.starts)):
             with contextlib.suppress(LostMotion):
-                there = residuals.evaluate(point)
-                begun.append((residuals.log_likelihood(there, residuals.noise_scale(there, law)), point))
-        if not begun:
-            return None
-        point = max(begun, key=lambda pair: pair[0])[1]
-        return minimise(residuals, point, law, _ENOUGH_OF_STEP, _TRIALS_OF_STEP)
+                there = residuals.evaluate(point, slopes=False)
+                begun.append((residuals.log_likelihood(there, residuals.noise_scale(there, law)), point, there))
+        for _, point, there in sorted(begun, key=lambda one: -one[0]):
+            with contextlib.suppress(LostMotion):
+                there = residuals.evaluate(point, begun=there)
+                return minimise(residuals, there, law, _ENOUGH_OF_STEP, _TRIALS_OF_STEP)
+        return None
 
 
 @dataclass(eq=False)
@@ -378,7 +379,8 @@ class _PathSearch:
         if key not in self.scores:
             done = fit.done
             folds = min(len(done.residuals.records), _FOLDS)
-            found = cross_validate(done.residuals, done.trial.point, done.noise, self.law, folds)[1]
+            self.tell(f"terms: {', '.join(key) or 'none'}; records are left out in {folds} groups")
+            found = cross_validate(done.residuals, done.trial, done.noise, self.law, folds)[1]
             self.scores[key] = found
             self.tell(f"terms: {', '.join(key) or 'none'}; RMS {np.exp(np.mean(found)):.4g} of records left out")
         return self.scores[key]

@@ -100,6 +100,12 @@ class _Model:
         pulled = 0.5 * float(np.sum(self.anchor.pull(trial.u) ** 2))
         return self.residuals.cost(trial, self.factors, self.noise) + pulled
 
+    def evaluate(self, point: Point) -> tuple[Trial, float]:
+        """The trial at a point, with derivatives if it is better, and by how much it is. Raises `LostMotion`."""
+        trial = self.residuals.evaluate(point, slopes=False)
+        fall = self.cost - self.cost_of(trial)
+        return self.residuals.evaluate(point, begun=trial) if fall > 0.0 else trial, fall
+
     def step(self, damping: float, limits: tuple[np.ndarray, np.ndarray] | None = None) -> DescentStep:
         u, states, unknowns = self.trial.u, self.residuals.states, self.unknowns
         limits = self.residuals.parameters.limits(u) if limits is None else limits
@@ -115,13 +121,12 @@ class _Model:
         """
         at, residuals = self.trial, self.residuals
         try:
-            near = residuals.evaluate(self.move(step, _NEARBY))
+            near = residuals.evaluate(self.move(step, _NEARBY), slopes=False)
         except LostMotion:
             return None
         curved, starts = [], np.broadcast_to(step.starts, at.starts.shape)
-        for batch, before, after, slopes in zip(
-            residuals.batches, at.residuals, near.residuals, at.slopes, strict=True
-        ):
+        pairs = zip(residuals.batches, at.residuals, near.residuals, at.slopes, strict=True)
+        for batch, before, after, slopes in pairs:
             local = np.append(step.u, 0.0)[residuals.unknowns.columns[batch.rows]]
             along = np.concatenate([starts[batch.rows], local], axis=1)
             curved.append(((after - before) / _NEARBY - np.einsum("ntsd,nd->nts", slopes, along)) / _NEARBY)
@@ -129,12 +134,10 @@ class _Model:
         of_starts, of_u = scale = column_norms(triangles, residuals.states, unknowns)
         pull, limits = (self.anchor.weight, np.zeros_like(at.u)), residuals.parameters.limits(at.u)
         more = eliminate(triangles, residuals.states, scale, damping, pull, unknowns, limits)
-        first, second = (
-            np.hypot(np.linalg.norm(of_u * x.u), np.linalg.norm(of_starts * x.starts)) for x in (step, more)
-        )
-        return (
-            DescentStep(step.u + more.u, step.starts + more.starts, step.gain) if second < _MOST_BEND * first else None
-        )
+        sizes = [np.hypot(np.linalg.norm(of_u * x.u), np.linalg.norm(of_starts * x.starts)) for x in (step, more)]
+        if not sizes[1] < _MOST_BEND * sizes[0]:
+            return None
+        return DescentStep(step.u + more.u, step.starts + more.starts, step.gain)
 
     def move(self, step: DescentStep, part: float = 1.0) -> Point:
         """The point at a part of a step."""
@@ -152,8 +155,8 @@ class _Model:
         if not self.is_enough(step.gain, enough):
             for part in (1.0, 0.1, 0.01):
                 with contextlib.suppress(LostMotion):
-                    trial = residuals.evaluate(self.move(step, part))
-                    if not self.is_enough(self.cost - self.cost_of(trial), enough):
+                    trial, fall = self.evaluate(self.move(step, part))
+                    if not self.is_enough(fall, enough):
                         return step.gain, trial
         return step.gain, None
 
@@ -165,17 +168,18 @@ class _Model:
 
 
 def minimise(
-    residuals: Residuals, point: Point, law: AbstractNoise, enough: float, limit: int = 60, anchor: Anchor | None = None
-) -> Descent:
-    """The unknowns that make the measurements likeliest, by a search from a point.
+    residuals: Residuals, begin: Point | Trial, law: AbstractNoise, enough: float, limit: int = 60,
+    anchor: Anchor | None = None,
+) -> Descent:  # fmt: skip
+    """The unknowns that make the measurements likeliest, by a search from a point, or from a trial of these residuals.
 
     It ends when a step without damping, within the reach of the transforms, promises to lower half the sum of squares,
     in units of the noise, by less than `enough`: then no parameter is further than √(2 enough) standard deviations from
     the minimum.
     Raises `LostMotion` where the motion from the first trial cannot be followed.
     """
-    trial = residuals.evaluate(point)
-    anchor = Anchor(point.u, np.zeros_like(point.u)) if anchor is None else anchor
+    trial = begin if isinstance(begin, Trial) else residuals.evaluate(begin)
+    anchor = Anchor(trial.u, np.zeros_like(trial.u)) if anchor is None else anchor
     anchor = anchor.add_prior(residuals.parameters.prior_weights)
     done, blind = _descend(residuals, trial, law, enough, limit, anchor, 1, _TAKEN_BACK)
     if blind is None or residuals.log_likelihood(blind, residuals.noise_scale(blind, law)) <= (
@@ -236,8 +240,7 @@ def _find_better_trial(
         for straight in (True, False):
             trials += 1
             with contextlib.suppress(LostMotion):
-                trial = residuals.evaluate(model.move(step))
-                fall = model.cost - model.cost_of(trial)
+                trial, fall = model.evaluate(model.move(step))
                 if fall > 0.0 and len(blind) < takes_back and (seen & ~_find_seen(residuals, trial)).any():
                     blind.append(trial)
                 elif fall > 0.0:

@@ -51,10 +51,18 @@ _GRADIENT_STEPS = 3000  # of a descent by gradients
 
 
 class Search:
-    """The search of a fit: `search(point)` is the end of one from a point; `readers` read states off the records."""
+    """The search of a fit: `search(point)` is the end of one from a point; `readers` read states off the records.
 
-    def __init__(self, residuals: Residuals, law: AbstractNoise, method: str, readers: list[Reader | None]):
+    A `rough` search tells how much of the signals is left. Learned functions need no more, since their prior is still
+    weak, and a search to the end would creep along what data do not tell; evidence ends it (`find_smoothness`).
+    """
+
+    def __init__(
+        self, residuals: Residuals, law: AbstractNoise, method: str, readers: list[Reader | None], rough: bool = False
+    ):
         self.residuals, self.law, self.method = residuals, law, method
+        rough |= bool(residuals.parameters.prior_weights.any())
+        self.enough = _ENOUGH_OF_LEVEL * residuals.measured if rough else _ENOUGH
         hybrid = [jumps(part.scene) for part in residuals.parts for _ in part.records]
         if method == "segments" and all(hybrid):
             raise ValueError('method="segments" cannot cut hybrid motion, whose mode is known at the start: leave it.')
@@ -87,18 +95,13 @@ class Search:
     # ---- whole records ----
 
     def _minimise_whole(self, point: Point) -> Descent:
-        """The search of whole records from a point; that of many begins where the search of a sample of them ends.
-
-        Learned functions need a rough answer here: their prior is still weak, and a search to the end would creep along
-        what data do not tell; evidence ends it (`find_smoothness`).
-        """
-        places, learned = self._sample_records(), self.residuals.parameters.prior_weights.any()
-        enough = _ENOUGH_OF_LEVEL * self.residuals.measured if learned else _ENOUGH
+        """The search of whole records from a point; that of many begins where the search of a sample of them ends."""
+        places = self._sample_records()
         if len(places) < len(self.residuals.pieces):
             with contextlib.suppress(LostMotion):
                 begin = self._minimise_sample(point, places, None)
-                return minimise(self.residuals, begin, self.law, enough, _TRIALS)
-        return minimise(self.residuals, point, self.law, enough, _TRIALS)
+                return minimise(self.residuals, begin, self.law, self.enough, _TRIALS)
+        return minimise(self.residuals, point, self.law, self.enough, _TRIALS)
 
     def _sample_records(self) -> np.ndarray:
         """The places of all pieces, or of an even sample of them where a part says enough about the parameters."""
@@ -141,7 +144,7 @@ class Search:
 
     def _search_pieces(self, level: Descent, joined: Descent | None) -> Descent:
         part, pieces = level.residuals, level.residuals.pieces
-        done = minimise(part, level.trial.point, self.law, _ENOUGH, _TRIALS)
+        done = minimise(part, level.trial, self.law, _ENOUGH, _TRIALS)
         worse = "fails"
         if joined is not None:
             worse = f"leaves {misfit(joined.noise, joined.residuals) / misfit(done.noise, part):.2g} times more"

@@ -9,7 +9,7 @@ such as the state in all directions of a Jacobian, is computed once:
 import ctypes
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from lagjax._native.series._lanes import emit, sincos_function
 from lagjax._program import OPERATIONS, Graph, StraightLine, eliminate_dead_code, operation_error
 
 _SET_ROWS = "set_rows"
+_MOST_ROOM = 2**16  # doubles of an interpreted line in lanes, half a megabyte of the stack of a thread
 
 
 class LineCode:
@@ -31,10 +32,10 @@ class LineCode:
     outputs). Inputs in `shared` are equal in all `rows` and passed as given (times, shared); x has the others.
 
     A line of more than `largest` operations is interpreted from an array of integers, for which LLVM takes no longer,
-    and has no shared inputs. With `moving`, a number of first inputs, it computes the running errors of the outputs
-    instead of the outputs (`_program._rounding`): a compiled line of them would be five times as long. A compiled line
-    may process several rows at once, in `lanes`. Every operation rounds, so that all of these forms have the same
-    digits on every processor, and in C (`_c_lines`). Raises `Unlowerable`.
+    and has no shared inputs: row by row, if more lanes took too much memory. With `moving`, a number of first inputs,
+    it computes the running errors of the outputs instead of the outputs (`_program._rounding`): a compiled line of them
+    would be five times as long. A line may process several rows at once, in `lanes`. Every operation rounds, so that
+    all of these forms have the same digits on every processor, and in C (`_c_lines`). Raises `Unlowerable`.
     """
 
     def __init__(
@@ -50,30 +51,32 @@ class LineCode:
         module.triple = ""
         filled = [k for k in range(outputs) if line.constant(k) != 0]
         long = moving is not None or len(line.nodes) + len(filled) > largest
-        lanes, self.shared = (1, ()) if long else (lanes, tuple(shared))
-        write = _RowWalk(line, inputs, filled, moving) if long else None
+        self.shared = () if long else tuple(shared)
+        write = _RowWalk(line, inputs, filled, moving, lanes) if long else None
+        lanes = lanes if write is None else write.lanes
         common, rest = (None, line) if long else _split_line(line, inputs, filled, self.shared)
         own, begin = inputs - len(self.shared), common and _write_shared_part(module, common, len(self.shared))
-        room = len(common.outputs) if common else 1 if write is None else 2 ** math.ceil(math.log2(2 * write.size))
+        room = len(common.outputs) if common else 1 if write is None else write.room
         code, sincos = (
             Code(module, "evaluate", LINE_ARGUMENTS, lanes, public=True, rounds=True),
             _sincos_of(module, rest, lanes, "rows"),
         )
-        (x, out, rows, given, times), room = code.arguments, code.stack(max(1, room))
+        (x, out, rows, given, times), room = code.arguments, code.stack(max(1, room), 64)
+        if write is None:
+            write_outputs = functools.partial(_write_line_outputs, code, sincos, rest, own, filled)
+        else:
+            write_outputs = functools.partial(write, code, sincos)
         with code.loop(times) as time:
             if begin is not None:
                 code.call(begin, code.element(given, time * len(self.shared)), room)
             x, out = code.element(x, time * rows * own), code.element(out, time * rows * outputs)
             if lanes > 1:
-                _write_tiles(code, sincos, rest, own, filled, (x, out, rows, room))
+                _write_tiles(code, write_outputs, own, outputs, (x, out, rows, room))
             else:
                 with code.loop(rows) as row:
                     here, there = code.element(x, row * own), code.element(out, row * outputs)
                     code.fill(there, outputs if len(filled) < outputs else 0)
-                    if write is not None:
-                        write(code, sincos, here, there, room)
-                    else:
-                        _write_line_outputs(code, sincos, rest, own, filled, here, there, room)
+                    write_outputs(here, there, room)
         code.finish()
         names = ("evaluate",) if write is None else ("evaluate", _SET_ROWS)
         level = 0 if write is None and compilation_work(rest, lanes) > WORK_OPTIMISED else None
@@ -188,11 +191,9 @@ def _write_line_outputs(
         code.store(code.lanes_of(number), code.element(out, k * lanes))
 
 
-def _write_tiles(
-    code: Code, sincos: Code | None, line: StraightLine, inputs: int, filled: list[int], arrays: tuple[Value, ...]
-) -> None:
+def _write_tiles(code: Code, write_outputs: Callable, inputs: int, outputs: int, arrays: tuple[Value, ...]) -> None:
     """Emit a loop over tiles of rows, one row per lane; the last tile repeats the last row."""
-    (x, out, rows, room), lanes, outputs = arrays, code.lanes, len(line.outputs)
+    (x, out, rows, room), lanes = arrays, code.lanes
     given, found = code.stack(inputs * lanes, 64), code.stack(outputs * lanes, 64)
     with code.loop(outputs * lanes) as k:
         code.store(code.as_value(0.0, DOUBLE), code.element(found, k))
@@ -205,7 +206,7 @@ def _write_tiles(
             row = code.element(x, (first.value + own) * inputs)
             with code.loop(inputs) as k:
                 code.store(code.load(code.element(row, k), DOUBLE), code.element(given, k * lanes + j))
-        _write_line_outputs(code, sincos, line, inputs, filled, given, found, room)
+        write_outputs(given, found, room)
         with code.loop(here) as j:
             row = code.element(out, (first.value + j) * outputs)
             with code.loop(outputs) as k:
@@ -216,12 +217,12 @@ def _write_tiles(
 class _RowWalk:
     """A straight line as an array `numbers` of integers that a loop interprets: three counts, then the rows.
 
-    A row is the case of an operation, and the slots of its operands and its result in `size` doubles of memory, where
-    constants and inputs come first. A slot is reused after its last use; the slots of outputs follow the rows. Errors,
-    if the first inputs are `moving`, are in a second memory of the same layout.
+    A row is the case of an operation, and the places of its operands and its result among `size` vectors of memory,
+    where constants and inputs come first. A place is taken again after its last use; the places of outputs follow the
+    rows. Errors, if the first inputs are `moving`, are in a second memory of the same layout. `room`: doubles of all.
     """
 
-    def __init__(self, line: StraightLine, inputs: int, filled: list[int], moving: int | None):
+    def __init__(self, line: StraightLine, inputs: int, filled: list[int], moving: int | None, lanes: int):
         self.inputs, self.moving, self.cases = inputs, moving, {}
         last_use = dict.fromkeys((line.outputs[k] for k in filled), len(line.nodes))
         for i in reversed(range(len(line.nodes))):
@@ -249,7 +250,11 @@ class _RowWalk:
             rows.append((case, at[i], *own, *[0] * (3 - len(own))))
         found = [(k, at[line.outputs[k]]) for k in filled]
         values = np.array([line.nodes[i][2] for i in constants], float).view(np.int64)
-        counts = len(rows), len(constants), len(found)
+        memories = 1 if moving is None else 2
+        self.lanes = lanes if (memories * self.size + inputs + len(line.outputs)) * lanes <= _MOST_ROOM else 1
+        self.room = 2 ** math.ceil(math.log2(memories * self.size * self.lanes))
+        rows = np.array(rows, np.int64).reshape(-1, 5) * [1, *[self.lanes] * 4]
+        counts, found = (len(rows), len(constants), len(found)), np.array(found, np.int64) * self.lanes
         self.numbers = np.concatenate([np.array(x, np.int64).ravel() for x in (counts, rows, values, found)])
 
     def __call__(self, code: Code, sincos: Code | None, x: Value, out: Value, room: Value) -> None:
@@ -262,11 +267,13 @@ class _RowWalk:
         begin.finish()
         table = code.load(Value(code, place), POINTER)
         rows, constants, outputs = (code.load(code.element(table, i, INTEGER), INTEGER) for i in range(3))
-        first = rows * 5 + 3
+        first, lanes = rows * 5 + 3, self.lanes
         rooms = [room] if self.moving is None else [room, code.element(room, self.size)]
-        code.copy(code.element(table, first), room, constants)
-        code.copy(x, code.element(room, constants), self.inputs)
-        for errors in rooms[1:]:
+        with code.loop(constants) as i:
+            constant = code.load(code.element(table, first + i), DOUBLE)
+            code.store(code.lanes_of(constant), code.element(room, i * lanes))
+        code.copy(x, code.element(room, constants * lanes), self.inputs * lanes)
+        for errors in rooms[1:]:  # in one lane
             code.fill(errors, constants + self.inputs)
             with code.loop(self.moving) as i:
                 code.store(abs(code.load(code.element(x, i), DOUBLE)), code.element(errors, constants + i))
@@ -286,7 +293,7 @@ class _RowWalk:
         with code.loop(outputs) as i:
             pair = first + constants + i * 2
             k, at = (code.load(code.element(table, pair + j, INTEGER), INTEGER) for j in range(2))
-            code.store(code.load(code.element(rooms[-1], at), DOUBLE), code.element(out, k))
+            code.store(code.load(code.element(rooms[-1], at), code.vector), code.element(out, k))
 
     def _write_case(self, op: str, attribute, kinds: tuple[str, ...]) -> StraightLine:
         """The line of one operation of operands of `kinds` (the last one is its own), or of it and its error."""
