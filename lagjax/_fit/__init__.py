@@ -45,7 +45,7 @@ from lagjax._fit.result._selection import Selection, keep_selected, select_terms
 from lagjax._fit.result._verdict import is_doubtful
 from lagjax._fit.search._descent import Descent
 from lagjax._fit.search._multistart import Waterfall, run_multistart
-from lagjax._fit.search._reader import TimeScales, first_starts, read_records, time_scales
+from lagjax._fit.search._reader import TimeScales, first_starts, read_records, start_noise, time_scales
 from lagjax._fit.search._search import Search, search_again
 from lagjax._fit.search._unexplained import Unexplained
 from lagjax._primitives import with_doubles
@@ -214,6 +214,8 @@ class _FitSearch(NamedTuple):
         readers = read_records(residuals)
         u = parameters.inverse(parameters.first)
         point, waterfall = Point(u, first_starts(residuals, readers, self.params0)), None
+        if any(jumps(part.scene) for part in residuals.parts):
+            residuals = residuals.choose_modes(point, start_noise(residuals, readers, point))
         residuals, point = _keep_unused(residuals, point)
         residuals = begin_weakly(residuals, point, self.law)
         if self.progress:

@@ -28,6 +28,7 @@ from lagjax._primitives import DOUBLE
 from lagjax._run.hybrid import Scene, first_law, jumps, require_scene
 
 PyTree = Any
+_HOLDING = "constraints", "contacts", "one_way", "slip"  # the ends of roles of functions that hold a start
 
 
 class GivenSystem(NamedTuple):
@@ -88,7 +89,7 @@ def _assemble_system(given: GivenSystem, parameters: Parameters, law: AbstractNo
     if jumps(system) and isinstance(observe, Delayed):
         raise ValueError("Sensors of contacts and hybrid motion cannot be lagjax.Delayed: shift the times instead.")
     asking = input_functions(scene)
-    if has_constraints(scene) and not any(role.endswith("constraints") for role in asking):
+    if (has_constraints(scene) or scene.touches) and not any(role.endswith(_HOLDING) for role in asking):
         manifold = Manifold(scene, layout, parameters, motions.projection, form if asking else None)
     elif has_constraints(scene) and fitted.any():
         raise ValueError("A start on constraints that ask for `inputs` cannot be fitted: give start=(q0, qdot0).")

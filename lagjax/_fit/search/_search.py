@@ -21,16 +21,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lagjax._equations import has_constraints
 from lagjax._fit.model._noise import AbstractNoise
 from lagjax._fit.model._pieces import Piece
-from lagjax._fit.model._records import Record
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals, SystemResiduals
 from lagjax._fit.search._adam import descend_gradient
 from lagjax._fit.search._descent import Anchor, Descent, minimise
 from lagjax._fit.search._multistart import misfit
-from lagjax._fit.search._reader import Reader, pad_states, short_windows, time_scales
+from lagjax._fit.search._reader import Reader, pad_states, short_windows, start_noise, time_scales
 from lagjax._fit.search._unexplained import measure_unexplained
-from lagjax._run.hybrid import jumps
+from lagjax._run.hybrid import Hybrid, jumps, laws
 from lagjax._show import even_places
 
 # In units of half the sum of squares: the end of a search, where parameters are within 0.05 standard deviations of
@@ -55,10 +55,11 @@ class Search:
 
     def __init__(self, residuals: Residuals, law: AbstractNoise, method: str, readers: list[Reader | None]):
         self.residuals, self.law, self.method = residuals, law, method
-        hybrid = [jumps(part.scene) for part in residuals.parts for _ in part.records]
-        if method == "segments" and all(hybrid):
-            raise ValueError('method="segments" cannot cut hybrid motion, whose mode is known at the start: leave it.')
-        self.readers = [None if is_hybrid else reader for is_hybrid, reader in zip(hybrid, readers, strict=True)]
+        whole = [isinstance(part.scene, Hybrid) and any(map(has_constraints, laws(part.scene))) for part in residuals.parts]
+        self.readers = list(readers)
+        for part, is_whole in zip(residuals.parts, whole, strict=True):
+            if is_whole:  # the constraints of a mode that is not the first
+                self.readers[part.frame.records] = [None] * len(part.records)
 
     def __call__(self, point: Point) -> Descent:
         if self.method == "segments" and not any(self.readers):
@@ -111,7 +112,7 @@ class Search:
     def _minimise_sample(self, point: Point, places: np.ndarray, length: int | None) -> Point:
         """The point with what the search of the pieces at `places`, up to a number of samples of each, comes to."""
         residuals = self.residuals
-        pieces = [Piece(k, samples[:length]) for k, samples in (residuals.pieces[place] for place in places)]
+        pieces = [piece._replace(places=piece.places[:length]) for piece in map(residuals.pieces.__getitem__, places)]
         part = residuals.with_pieces(pieces, residuals.fitted[places])
         begin, enough = Point(point.u, point.starts[places]), _ENOUGH_OF_LEVEL * part.measured
         end = minimise(part, begin, self.law, enough, _TRIALS_OF_LEVEL if length else _TRIALS).trial
@@ -203,6 +204,8 @@ class Search:
                 best |= {(k, place): y for place, y in zip(new, read, strict=True)}
         fitted = np.array([self.residuals.fitted[k] or place > 0 for k, place in firsts])
         part, point = self.residuals.with_pieces(pieces, fitted), Point(u, np.stack([best[first] for first in firsts]))
+        if any(jumps(one.scene) for one in part.parts):
+            part = part.choose_modes(point, start_noise(part, self.readers, point))
         done = minimise(part, point, self.law, _ENOUGH_OF_LEVEL * part.measured, _TRIALS_OF_LEVEL, anchor)
         best |= dict(zip(firsts, done.trial.starts, strict=True))
         return done
@@ -211,7 +214,7 @@ class Search:
         """The u that suits the accelerations of local cubics: these have one minimum where segments are too long."""
         short, states, owners = [], [], []
         for part, scale in zip(self.residuals.parts, self._time_scales(u), strict=True):
-            if np.isfinite(scale):
+            if np.isfinite(scale) and not jumps(part.scene):
                 records, begun, of = short_windows(self._readers_of(part), 0.25 * scale)
                 states.append(pad_states(begun, self.residuals.states))
                 short.append(part.with_records(records, np.ones(len(records), bool)))
@@ -241,7 +244,9 @@ class Search:
     def _cut_records(self, u) -> list[list[Piece]]:
         pairs = zip(self.residuals.parts, self._time_scales(u), strict=True)
         scales = [scale for part, scale in pairs for _ in part.records]
-        return _levels([None if reader is None else reader.record for reader in self.readers], scales)
+        jumping = [jumps(part.scene) for part in self.residuals.parts for _ in part.records]
+        modes = [piece.mode for piece in self.residuals.pieces]
+        return _levels(self.readers, scales, jumping, modes)
 
     # ---- gradients ----
 
@@ -322,13 +327,14 @@ def _separation(done: Descent) -> float:
 
 # ---- cuts of records into segments -----------------------------------------------------------------------------------
 
-_FEWEST_IN_SEGMENT = 8  # samples
+_FEWEST_IN_SEGMENT, _ASIDE = 8, 3  # samples; the part of a segment by which an edge may move
 
 
-def _levels(records: list[Record | None], scales: list[float]) -> list[list[Piece]]:
+def _levels(readers: list[Reader | None], scales: list[float], jumping: list[bool], modes: list) -> list[list[Piece]]:
     """Cuts of records from segments of two of their time `scales` to whole records, each twice as long as the one
-    before; none where records are hardly longer, and None instead of a record leaves it out."""
-    edges = [(k, record, _edges(record, 2.0 * scales[k])) for k, record in enumerate(records) if record is not None]
+    before; none where records are hardly longer, and None instead of a reader leaves its record out."""
+    reading = [(k, reader) for k, reader in enumerate(readers) if reader is not None]
+    edges = [(k, reader.record, _edges(reader, 2.0 * scales[k], jumping[k])) for k, reader in reading]
     most, found, stride = max(len(e) - 1 for *_, e in edges), [], 1
     while stride < most:
         pieces = []
@@ -336,15 +342,20 @@ def _levels(records: list[Record | None], scales: list[float]) -> list[list[Piec
             cut = [*e[:-1:stride].tolist(), len(record)]
             if len(cut) > 2 and 2 * (e[-1] - cut[-2]) < e[min(stride, len(e) - 1)] - e[0]:
                 del cut[-2]  # a rest shorter than half a segment joins the one before
-            pieces += [Piece(k, np.arange(a, b)) for a, b in itertools.pairwise(cut)]
+            pieces += [Piece(k, np.arange(a, b), () if a else modes[k]) for a, b in itertools.pairwise(cut)]
         found.append(pieces)
         stride *= 2
     return found
 
 
-def _edges(record: Record, length: float) -> np.ndarray:
-    """The first samples of the shortest segments of one record, and its length."""
-    ts = record.ts
+def _edges(reader: Reader, length: float, jumping: bool) -> np.ndarray:
+    """The first samples of the shortest segments of one record, and its length; where the motion jumps, those near by
+    that look smooth."""
+    ts = reader.record.ts
     count = max(1, int((ts[-1] - ts[0]) / length)) if np.isfinite(length) else 1
     count = max(1, min(count, len(ts) // _FEWEST_IN_SEGMENT))
-    return np.unique(np.append(np.searchsorted(ts, np.linspace(ts[0], ts[-1], count + 1)[:-1]), len(ts)))
+    found = np.searchsorted(ts, np.linspace(ts[0], ts[-1], count + 1)[:-1])
+    if jumping and count > 1:
+        aside = int(np.diff(found).min()) // _ASIDE
+        found[1:] = [reader.smoothest(place - aside, min(place + aside, len(ts) - 1)) for place in found[1:]]
+    return np.unique(np.append(found, len(ts)))
