@@ -72,6 +72,9 @@ class Trial(NamedTuple):
         return np.concatenate([r.reshape(-1, r.shape[-1]) for r in self.residuals])
 
 
+_PLAINLY = 9.0  # twice the log-likelihood by which an open contact must be likelier than a closed one
+
+
 class LostMotion(ValueError):
     """A motion of a trial that could not be followed: of which record, from when, and what became of it."""
 
@@ -251,7 +254,10 @@ class SystemResiduals:
             pieces = [piece._replace(mode=mode) for piece, mode in zip(self.pieces, modes, strict=True)]
             with contextlib.suppress(LostMotion):
                 left[k] = replace(self, pieces=pieces)._measure_left(trial, numbers, directions)
-        return [modes[k] for modes, k in zip(found, np.argmin(left, axis=0).tolist(), strict=True)]
+        if not isinstance(self.scene, Hybrid):  # of alike ones that which leaves fewest numbers free
+            samples = np.array([len(piece.places) for piece in self.pieces])
+            left *= np.exp(-_PLAINLY * np.arange(most)[:, None] / samples)
+        return [of[min(k, len(of) - 1)] for of, k in zip(found, np.argmin(left, axis=0).tolist(), strict=True)]
 
     def _possible_modes(self, trial: Trial, numbers, noise: np.ndarray) -> list[list[tuple[int, ...]]]:
         found, begins = [[piece.mode] for piece in self.pieces], [piece.places[0] == 0 for piece in self.pieces]

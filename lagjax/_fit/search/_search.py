@@ -63,7 +63,10 @@ class Search:
 
     def __call__(self, point: Point) -> Descent:
         if self.method == "segments" and not any(self.readers):
-            raise ValueError('method="segments" reads starts off data: for that values must have the structure of q.')
+            raise ValueError(
+                'method="segments" reads starts off data: for that values must have the structure of q, and no mode of a '
+                "Hybrid may have constraints."
+            )
         levels_done: list[Descent] = []
         if self.method != "whole" and any(self.readers):
             point, levels_done = self._fit_growing_segments(point)
