@@ -240,6 +240,7 @@ class _FitSearch(NamedTuple):
         """The end of the search from the starts that were asked for; where that is left to it, from one, and from more
         if that one is not enough: of learned functions, which have one least for a smoothness, evidence says so later.
         Raises `LostMotion` where none can be followed."""
+        whole = Search(residuals, self.law, "whole", search.readers) if self.method == "auto" else search
         tell, lost, chooses = _print_line if self.progress else None, None, looks_further and self.starts is None
         chooses &= len(residuals.parameters) > 0 and any(jumps(part.scene) for part in residuals.parts)
         chooses &= not residuals.parameters.prior_weights.any()
@@ -257,7 +258,7 @@ class _FitSearch(NamedTuple):
                 tell(f"One start is not enough, others are tried: {lost or 'the motion may be another one.'}")
             begin, seed = point if done is None else done.trial.point, [self.seed, len(misfits)]
             try:
-                other, some = run_multistart(residuals, search, begin, _STARTS_AT_A_TIME, seed, tell)
+                other, some = run_multistart(residuals, whole, begin, _STARTS_AT_A_TIME, seed, tell)
             except LostMotion:
                 text = f"{lost} Nor could the motions from {_STARTS_AT_A_TIME - 1} other starts be followed."
                 raise LostMotion(text) from None
@@ -310,8 +311,10 @@ class _FitSearch(NamedTuple):
 
 def _keep_unused(residuals: Residuals, point: Point) -> tuple[Residuals, Point]:
     """The residuals and the point where numbers of records on which the signals of their system do not depend at all,
-    but those of others do, stay as they are: the offset of a sensor that one of two machines has."""
+    but those of others do, stay as they are: the offset of a sensor that one of two machines has; so do those of a record
+    whose motion is that of another."""
     states, unknowns, kept = residuals.states, residuals.unknowns, np.zeros(len(residuals.parameters), bool)
+    kept[np.setdiff1d(np.arange(len(kept)), unknowns.columns)] = True
     if unknowns.own and len(residuals.parts) > 1:
         with contextlib.suppress(LostMotion):
             own = (x[..., states : states + unknowns.own].any(axis=(0, 1, 2)) for x in residuals.evaluate(point).slopes)

@@ -169,7 +169,9 @@ def _programs_once(scene: Scene, layout: Layout, tree, leaves: tuple, options: t
     def run(state, ts, table, mode):
         y0, numbers = state
         q, qdot = map(layout.restore, halves(y0))
-        trajectory = simulate(begin_in(scene, mode), q, qdot, ts, scene_params(numbers, table), throw=False, **dict(options))
+        trajectory = simulate(
+            begin_in(scene, mode), q, qdot, ts, scene_params(numbers, table), throw=False, **dict(options)
+        )
         rows = jax.vmap(lambda q, v: jnp.concatenate([layout.flatten(q), layout.flatten(v)]))
         end = jnp.concatenate([layout.flatten(trajectory.end.q), layout.flatten(trajectory.end.qdot)])
         path = rows(trajectory.q, trajectory.qdot)
@@ -251,7 +253,9 @@ class Manifold:
             def values(y):
                 return _contact_values(FlatContacts.from_system(scene, layout, params), y, t, params)
 
-            reach = jax.tree.map(lambda slopes: jnp.sqrt((slopes * noise) ** 2 @ jnp.ones(y.size)), jax.jacfwd(values)(y))
+            reach = jax.tree.map(
+                lambda slopes: jnp.sqrt((slopes * noise) ** 2 @ jnp.ones(y.size)), jax.jacfwd(values)(y)
+            )
             return values(y), reach
 
         def project_with_derivatives(*arguments):
@@ -282,7 +286,6 @@ class Manifold:
         starts, by_y, by_numbers = (np.stack([np.asarray(x, float) for x in part]) for part in zip(*rows, strict=True))
         return starts, by_y, np.einsum("nip,nlp->nli", by_numbers, directions)
 
-
     def possible_modes(self, y, t, numbers, inputs, noise: np.ndarray) -> list[list[tuple[int, ...]]]:
         """The modes (see `Piece`) that states `y` (N, 2n) may have within their `noise` (N, 2n): all contacts open,
         those that may be closed closed, and all of these that may stick sticking."""
@@ -290,7 +293,9 @@ class Manifold:
         for row, near in zip(self._rows(y, t, numbers, inputs), noise, strict=True):
             close = [np.abs(x) <= r for x, r in zip(*jax.tree.map(np.asarray, self._measure(*row, near)), strict=True)]
             closed, sticks = (close[0] & close[1]).astype(int), close[2].all(axis=1).astype(int)
-            modes = [np.append(c, s).tolist() for c, s in ((0, 0), (1, 0), (1, 1)) for c, s in [(c * closed, s * sticks)]]
+            modes = [
+                np.append(c, s).tolist() for c, s in ((0, 0), (1, 0), (1, 1)) for c, s in [(c * closed, s * sticks)]
+            ]
             found.append(list(dict.fromkeys(map(tuple, modes if closed.any() else modes[:1]))))
         return found
 
@@ -316,7 +321,10 @@ def _project_onto_contacts(scene: System, layout: Layout, y: jax.Array, t, param
     gaps = flat.gaps(q, t, params)
 
     def nearest(q, v, closed):
-        inside = ContactParams(params, Contacts(closed, sticks, jnp.ones((sticks.size, flat.shapes.directions)), jnp.zeros(0), jnp.ones(())))
+        inside = ContactParams(
+            params,
+            Contacts(closed, sticks, jnp.ones((sticks.size, flat.shapes.directions)), jnp.zeros(0), jnp.ones(())),
+        )
         return ContactScene(scene)._motion(layout, inside).nearest_consistent(q, v, t, inside)
 
     within, _ = nearest(q, v, closed.at[: gaps.size].max(gaps < 0))

@@ -137,7 +137,7 @@ class SystemResiduals:
         self.least = self.rtol * self.size
         self.layout: Layout = self.signals.layout
         self.states = 2 * self.layout.size
-        starts = [self.records[piece.record].start if piece.places[0] == 0 else None for piece in self.pieces]
+        starts = [self.records[piece.record].begins if piece.places[0] == 0 else None for piece in self.pieces]
         self.origins = Origins(starts, self.layout, self.restore)
         self.modes = [piece.mode for piece in self.pieces]
         self.fits_on_constraints = self.manifold is not None and bool(self.fitted.any())
@@ -269,7 +269,7 @@ class SystemResiduals:
             t, inputs = self._first_samples()
             given = trial.starts[self.frame.rows, : self.states], t, numbers, inputs, noise[self.frame.rows]
             for row, modes in zip(rows, self.manifold.possible_modes(*(x[rows] for x in given)), strict=True):
-                start = self.records[self.pieces[row].record].start if begins[row] else None
+                start = self.records[self.pieces[row].record].begins if begins[row] else None
                 found[row] = modes if start is None else modes[-1:] if isinstance(start, Guess) else found[row]
         return found
 
@@ -404,7 +404,7 @@ class SystemResiduals:
         """The starts (M, 2n) of all systems for JAX, of which some of this one are functions of the parameters (N, P)
         of its pieces."""
         for row, piece, own in zip(self.frame.rows, self.pieces, numbers, strict=True):
-            start = self.records[piece.record].start
+            start = self.records[piece.record].begins
             if callable(start) and piece.places[0] == 0:
                 flat = jnp.concatenate([self.layout.flatten(half) for half in start_pair(start, self.restore(own))])
                 starts = starts.at[row, : self.states].set(flat)
@@ -419,6 +419,8 @@ class Residuals:
       whole records.
     - `parts`: the systems that have pieces. `records`; `states`: the numbers of a start. `unknowns`: those of the N
       pieces.
+    - `motions` (R,): of every record the one of the same motion that has the start. `leads` (N,): of every piece that
+      which has it, `own_starts` (N,) whether it is its own, and free.
     - `names`, `size`, `least` (S,): signals, their root mean square, and the smallest noise that can be estimated.
     - `batches`: the samples, with a column for every signal; `weights` (M, S): all of theirs; `measured`: how many.
     - `watch` is called with every trial of `evaluate`.
@@ -431,6 +433,7 @@ class Residuals:
         pieces: list[Piece] | None = None,
         fitted: np.ndarray | None = None,
         watch: Callable[[Trial | LostMotion], None] | None = None,
+        motions: np.ndarray | None = None,
     ):
         self.systems, self.watch, self.parameters = list(systems), watch, parameters
         self.records = [record for system in systems for record in system.records]
@@ -441,6 +444,10 @@ class Residuals:
             pieces = [piece._replace(record=k + piece.record) for k, system in pairs for piece in system.pieces]
             fitted = np.concatenate([system.fitted for system in systems])
         self.pieces, self.fitted = pieces, fitted
+        self.motions = np.arange(len(self.records)) if motions is None else motions
+        firsts = {piece.record: row for row, piece in enumerate(pieces) if piece.places[0] == 0}
+        self.leads = np.array([firsts.get(self.motions[piece.record], row) for row, piece in enumerate(pieces)])
+        self.own_starts = fitted & (self.leads == np.arange(len(pieces)))
         self.states = max(system.states for system in systems)
         self.parts = self._split_by_system()
         heads = ["" if part.name is None else f"{part.name}: " for part in self.parts]
@@ -474,7 +481,7 @@ class Residuals:
 
     def with_pieces(self, pieces: list[Piece], fitted: np.ndarray) -> "Residuals":
         """The residuals of other pieces of the records; the signals are those of systems with a piece."""
-        return Residuals(self.systems, self.parameters, pieces, fitted, self.watch)
+        return Residuals(self.systems, self.parameters, pieces, fitted, self.watch, self.motions)
 
     def choose_modes(self, point: Point, noise: np.ndarray) -> "Residuals":
         """The same residuals, whose pieces begin in the likeliest modes; `noise` (N, 2n) is that of the starts."""
@@ -486,12 +493,13 @@ class Residuals:
             given = trial, numbers[self.parameters.places[own]], directions[own], noise
             for row, mode in zip(rows, part.choose_modes(*given), strict=True):
                 pieces[row] = pieces[row]._replace(mode=mode)
+        pieces = [piece._replace(mode=pieces[lead].mode) for piece, lead in zip(pieces, self.leads, strict=True)]
         return self.with_pieces(pieces, self.fitted)
 
     def _trial_at(self, point: Point) -> Trial:
         constrained, square = any(part.fits_on_constraints for part in self.parts), (self.states, self.states)
         across = np.zeros((len(point.starts), *square)) if constrained else None
-        return Trial(point.u, point.starts.copy(), [], [], across)
+        return Trial(point.u, point.starts[self.leads], [], [], across)
 
     def with_parameters(self, parameters: Parameters) -> "Residuals":
         other = copy.copy(self)
@@ -582,7 +590,8 @@ class Residuals:
         return self.triangles(self.working_trial(point, noise), self.factors(point, noise))
 
     def triangles(self, point: Trial, factors: list[np.ndarray]) -> np.ndarray:
-        """The weighted rows of each piece, compressed: (N, D + 1, D + 1), the residual as last column."""
+        """The weighted rows of each piece, compressed: (N, D + 1, D + 1), the residual as last column. Rows of the same
+        motion stand with the first of its pieces."""
         columns = point.slopes[0].shape[-1] + 1
         found = np.zeros((len(self.pieces), columns, columns))
         for batch, factor, r, slopes in zip(self.batches, factors, point.residuals, point.slopes, strict=True):
@@ -594,6 +603,9 @@ class Residuals:
                 more = np.pad(size * point.across[batch.rows], ((0, 0), (0, 0), (0, columns - self.states)))
                 rows = np.concatenate([rows, more], axis=1)
             found[batch.rows] = compress_rows(rows)
+        for row in np.flatnonzero(self.leads != np.arange(len(self.pieces))):
+            both = found[[self.leads[row], row]].reshape(1, -1, columns)
+            found[self.leads[row]], found[row] = compress_rows(both)[0], 0.0
         return found
 
     # ---- what rounding makes of samples ----
@@ -629,7 +641,7 @@ class Residuals:
     @property
     def free_states(self) -> int:
         """The numbers of all starts that are fitted."""
-        return sum(part.states * int(part.fitted.sum()) for part in self.parts)
+        return sum(part.states * int(self.own_starts[part.frame.rows].sum()) for part in self.parts)
 
     def columns(self, record: int) -> slice:
         part = self._owner(record)

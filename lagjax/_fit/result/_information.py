@@ -110,7 +110,7 @@ def information(descent: Descent) -> Information:
     middle, rows_of = np.diag((prior / unit) ** 2 / share), []
     for batch, factor, slopes in zip(residuals.batches, factors, trial.slopes, strict=True):
         own, columns = factor[..., None] * slopes, unknowns.select(batch.rows)
-        own = eliminate_starts(triangles[batch.rows], own, states) / unit_of[batch.rows]
+        own = eliminate_starts(triangles[residuals.leads[batch.rows]], own, states) / unit_of[batch.rows]
         rows_of.append(own)
         for s in np.flatnonzero(np.isnan(residuals.sensor.step)):
             middle += columns.add(correlated_square(close_gaps(own[:, :, s], batch.weights[..., s] > 0), laws[s].lags))

@@ -53,7 +53,9 @@ class Reader(NamedTuple):
         """The sample from `first` to `last` about which the cubics leave least: away from where the motion jumps."""
         places = np.arange(first, last + 1)
         scatter = np.maximum(self.scatter, np.finfo(float).tiny)
-        return first + int(np.argmin(np.max([one[2] / s for one, s in zip(self.read(places), scatter, strict=True)], 0)))
+        return first + int(
+            np.argmin(np.max([one[2] / s for one, s in zip(self.read(places), scatter, strict=True)], 0))
+        )
 
     def read(self, places) -> list[tuple]:
         """The result of `_read_states` for every signal at the samples `places`."""
@@ -75,6 +77,7 @@ def _read_states(ts: np.ndarray, t: np.ndarray, y: np.ndarray, window: int):
 
 def _window(ts: np.ndarray, t: np.ndarray, y: np.ndarray) -> tuple[int, float]:
     """The number of samples in the window for one signal, and the scatter about the shortest."""
+
     def left(window: int) -> float:
         return float(np.sqrt(np.mean(_read_states(ts, t, y, window)[2] ** 2)))
 
@@ -178,10 +181,12 @@ def first_starts(residuals: Residuals, readers: list[Reader | None], params0: An
     """The first guess of the starts of all records, (N, 2n) of the system with the most coordinates."""
     found = []
     for part in residuals.parts:
-        for place, (record, reader) in enumerate(zip(part.records, readers[part.frame.records], strict=True)):
+        first = part.frame.records.start
+        for place, motion in enumerate(residuals.motions[part.frame.records].tolist()):
+            record, reader = residuals.records[motion], readers[motion]
             with errors_of_system(part.name):
                 state = known_start(record, part.layout, place, params0)
-                state = read_start(reader, record, part, f"records[{place}]") if state is None else state
+                state = read_start(reader, record, part, f"records[{motion - first}]") if state is None else state
                 found.append(pad_states(state, residuals.states))
     return np.stack(found)
 
@@ -201,8 +206,9 @@ def read_start(reader: Reader | None, record: Any, part: SystemResiduals, called
 def start_noise(residuals: Residuals, readers: list[Reader | None], point: Point) -> np.ndarray:
     """How far the starts (N, 2n) of the pieces may be off; what a record says of them is exact, to rounding."""
     noise = _ROUNDED * np.max(np.abs(point.starts), axis=1, keepdims=True) + np.zeros_like(point.starts)
-    for row, (record, places, _) in enumerate(residuals.pieces):
-        if (reader := readers[record]) is not None and (places[0] > 0 or residuals.records[record].start is None):
+    for row, (own, places, _) in enumerate(residuals.pieces):
+        record = residuals.motions[own]
+        if (reader := readers[record]) is not None and (places[0] > 0 or residuals.records[record].begins is None):
             noise[row] = pad_states(reader.noise, residuals.states)
     return noise
 

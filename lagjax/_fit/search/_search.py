@@ -55,13 +55,35 @@ class Search:
 
     def __init__(self, residuals: Residuals, law: AbstractNoise, method: str, readers: list[Reader | None]):
         self.residuals, self.law, self.method = residuals, law, method
-        whole = [isinstance(part.scene, Hybrid) and any(map(has_constraints, laws(part.scene))) for part in residuals.parts]
+        whole = [
+            isinstance(part.scene, Hybrid) and any(map(has_constraints, laws(part.scene))) for part in residuals.parts
+        ]
         self.readers = list(readers)
+        self.jumping = np.array([jumps(part.scene) for part in residuals.parts for _ in part.records])
         for part, is_whole in zip(residuals.parts, whole, strict=True):
             if is_whole:  # the constraints of a mode that is not the first
                 self.readers[part.frame.records] = [None] * len(part.records)
 
     def __call__(self, point: Point) -> Descent:
+        """The end of a search from a point. Where the motion jumps and whole records can be followed from there, that costs
+        less than segments, which are for what is left."""
+        first = None
+        if self.method == "auto" and self.jumping.all() and any(self.readers):
+            with contextlib.suppress(LostMotion):
+                first = self._minimise_whole(point)
+                if not measure_unexplained(first).doubted:
+                    return first
+        try:
+            done = self._search(point)
+        except LostMotion:
+            if first is None:
+                raise
+            return first
+        if first is None or done.residuals is not first.residuals:
+            return done
+        return max(first, done, key=lambda one: one.residuals.log_likelihood(one.trial, one.noise))
+
+    def _search(self, point: Point) -> Descent:
         if self.method == "segments" and not any(self.readers):
             raise ValueError(
                 'method="segments" reads starts off data: for that values must have the structure of q, and no mode of a '
@@ -70,15 +92,15 @@ class Search:
         levels_done: list[Descent] = []
         if self.method != "whole" and any(self.readers):
             point, levels_done = self._fit_growing_segments(point)
-        good = _last_followed_level(levels_done)
-        if len(levels_done) - good > _LOST:
+        good, all_cut = _last_followed_level(levels_done), all(self.readers)
+        if len(levels_done) - good > _LOST and all_cut:
             return self._search_pieces(levels_done[good], levels_done[-1])
         done, lost = None, LostMotion()
         try:
             done = self._minimise_whole(point)
         except LostMotion as reason:
             lost = reason
-        if levels_done and (done is None or not done.converged or measure_unexplained(done).motion):
+        if levels_done and all_cut and (done is None or not done.converged or measure_unexplained(done).motion):
             good = _last_followed_level([*levels_done, *([] if done is None else [done])])
             if good < len(levels_done) and misfit(levels_done[good].noise, levels_done[good].residuals) < _COARSE:
                 return self._search_pieces(levels_done[good], done)
@@ -207,7 +229,7 @@ class Search:
                 best |= {(k, place): y for place, y in zip(new, read, strict=True)}
         fitted = np.array([self.residuals.fitted[k] or place > 0 for k, place in firsts])
         part, point = self.residuals.with_pieces(pieces, fitted), Point(u, np.stack([best[first] for first in firsts]))
-        if any(jumps(one.scene) for one in part.parts):
+        if self.jumping.any():
             part = part.choose_modes(point, start_noise(part, self.readers, point))
         done = minimise(part, point, self.law, _ENOUGH_OF_LEVEL * part.measured, _TRIALS_OF_LEVEL, anchor)
         best |= dict(zip(firsts, done.trial.starts, strict=True))
@@ -247,9 +269,8 @@ class Search:
     def _cut_records(self, u) -> list[list[Piece]]:
         pairs = zip(self.residuals.parts, self._time_scales(u), strict=True)
         scales = [scale for part, scale in pairs for _ in part.records]
-        jumping = [jumps(part.scene) for part in self.residuals.parts for _ in part.records]
         modes = [piece.mode for piece in self.residuals.pieces]
-        return _levels(self.readers, scales, jumping, modes)
+        return _levels(self.readers, scales, self.jumping, modes)
 
     # ---- gradients ----
 
@@ -333,7 +354,7 @@ def _separation(done: Descent) -> float:
 _FEWEST_IN_SEGMENT, _ASIDE = 8, 3  # samples; the part of a segment by which an edge may move
 
 
-def _levels(readers: list[Reader | None], scales: list[float], jumping: list[bool], modes: list) -> list[list[Piece]]:
+def _levels(readers: list[Reader | None], scales: list[float], jumping: np.ndarray, modes: list) -> list[list[Piece]]:
     """Cuts of records from segments of two of their time `scales` to whole records, each twice as long as the one
     before; none where records are hardly longer, and None instead of a reader leaves its record out."""
     reading = [(k, reader) for k, reader in enumerate(readers) if reader is not None]
