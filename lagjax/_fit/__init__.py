@@ -311,8 +311,8 @@ class _FitSearch(NamedTuple):
 
 def _keep_unused(residuals: Residuals, point: Point) -> tuple[Residuals, Point]:
     """The residuals and the point where numbers of records on which the signals of their system do not depend at all,
-    but those of others do, stay as they are: the offset of a sensor that one of two machines has; so do those of a record
-    whose motion is that of another."""
+    but those of others do, stay as they are: the offset of a sensor that one of two machines has; so do those of a
+    record whose motion is that of another."""
     states, unknowns, kept = residuals.states, residuals.unknowns, np.zeros(len(residuals.parameters), bool)
     kept[np.setdiff1d(np.arange(len(kept)), unknowns.columns)] = True
     if unknowns.own and len(residuals.parts) > 1:

@@ -59,10 +59,9 @@ def assemble_residuals(given: list[GivenSystem], parameters: Parameters, law: Ab
     for one in given:
         with errors_of_system(one.name):
             systems.append(_assemble_system(one, parameters, law))
-        places = {id(record): len(motions) + k for k, record in enumerate(one.records)}
-        motions += [
-            places.get(id(record.start), place) for record, place in zip(one.records, places.values(), strict=True)
-        ]
+        first = len(motions)
+        places = {id(record): first + k for k, record in enumerate(one.records)}
+        motions += [places.get(id(record.start), first + k) for k, record in enumerate(one.records)]
     return Residuals(systems, parameters.select(motions), motions=np.array(motions))
 
 

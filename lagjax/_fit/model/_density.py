@@ -49,7 +49,8 @@ class Density:
         for part in residuals.parts:
             if part.fits_on_constraints and (part.manifold.constrained or any(map(any, part.modes))):
                 raise ValueError(
-                    "There is no density for fitted starts on constraints, or on closed contacts: give start=(q0, qdot0)."
+                    "There is no density for fitted starts on constraints, or on closed contacts: give "
+                    "start=(q0, qdot0)."
                 )
             if part.signals.delays is not None:
                 raise ValueError("There is no density for lagjax.Delayed sensors: keep the delay, and shift the times.")

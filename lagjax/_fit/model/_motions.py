@@ -8,9 +8,9 @@ nothing; other engines and hybrid motion go through `jax.jvp` of `simulate`, the
 against.
 
 **Starts.** `Origins` are those that are functions of the parameters, `Manifold` those on constraints, and on contacts
-that are closed. There a start has fewer directions than numbers. The unknown is any state y near them, and the motion begins at the consistent
-state P(y) nearest to it (`System.project`): what a step of the search leaves of the constraints is taken back, its
-derivative is that along them, and a direction across them changes nothing.
+that are closed. There a start has fewer directions than numbers. The unknown is any state y near them, and the motion
+begins at the consistent state P(y) nearest to it (`System.project`): what a step of the search leaves of the
+constraints is taken back, its derivative is that along them, and a direction across them changes nothing.
 """
 
 import abc

@@ -317,7 +317,7 @@ def require_records(records) -> list[Any]:
             raise ValueError(f"records[{place}] holds no sample: all its values are NaN or have no weight.")
         if isinstance(record.start, MeasuredSignal) and record.start not in listed:
             raise ValueError(
-                f"records[{place}] begins with a record that is not among `records`: give that one, the same object, too."
+                f"records[{place}] begins with a record that is not among `records`: give that one, the same object."
             )
     return listed
 

@@ -446,7 +446,9 @@ class Residuals:
         self.pieces, self.fitted = pieces, fitted
         self.motions = np.arange(len(self.records)) if motions is None else motions
         firsts = {piece.record: row for row, piece in enumerate(pieces) if piece.places[0] == 0}
-        self.leads = np.array([firsts.get(self.motions[piece.record], row) for row, piece in enumerate(pieces)])
+        begins = [firsts.get(self.motions[piece.record], row) for row, piece in enumerate(pieces)]
+        leads = (row if piece.places[0] else begins[row] for row, piece in enumerate(pieces))
+        self.leads = np.array(list(leads))
         self.own_starts = fitted & (self.leads == np.arange(len(pieces)))
         self.states = max(system.states for system in systems)
         self.parts = self._split_by_system()

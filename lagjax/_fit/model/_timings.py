@@ -77,8 +77,8 @@ class Timings(MeasuredSignal):
             raise ValueError("direction is for functions: a transition, or a contact, has its own. Leave it at 0.")
         if self.start is None:
             raise TypeError(
-                "A lagjax.Timings needs a start: (q0, qdot0), lagjax.Guess(q0, qdot0), a function, or the lagjax.Record of "
-                "the same motion."
+                "A lagjax.Timings needs a start: (q0, qdot0), lagjax.Guess(q0, qdot0), a function, or the lagjax.Record "
+                "of the same motion."
             )
         if isinstance(self.start, Record):
             if self.start.ts[0] != self.t0:
@@ -217,7 +217,8 @@ class Clock:
 def build_clock(
     scene: Scene, layout: Layout, restore: Callable, params: PyTree, timings: Timings, rtol: float
 ) -> Clock:
-    """The clock of a scene; `restore` makes its parameters of their numbers, `params` are an example. Raises `ValueError` for functions of a hybrid one, and for what is of another scene."""
+    """The clock of a scene; `restore` makes its parameters of their numbers, `params` are an example. Raises
+    `ValueError` for functions of a hybrid one, and for what is of another scene."""
     find = _choose_finder(scene, _sections(timings.section)[1][0])
     flat, span = timings.flat, np.array([float(timings.t0), _last_time(timings)])
     instants, happens, advice = find(scene, layout, params, timings, rtol)

@@ -65,8 +65,8 @@ class Search:
                 self.readers[part.frame.records] = [None] * len(part.records)
 
     def __call__(self, point: Point) -> Descent:
-        """The end of a search from a point. Where the motion jumps and whole records can be followed from there, that costs
-        less than segments, which are for what is left."""
+        """The end of a search from a point. Where the motion jumps and whole records can be followed from there, that
+        costs less than segments, which are for what is left."""
         first = None
         if self.method == "auto" and self.jumping.all() and any(self.readers):
             with contextlib.suppress(LostMotion):
@@ -86,8 +86,8 @@ class Search:
     def _search(self, point: Point) -> Descent:
         if self.method == "segments" and not any(self.readers):
             raise ValueError(
-                'method="segments" reads starts off data: for that values must have the structure of q, and no mode of a '
-                "Hybrid may have constraints."
+                'method="segments" reads starts off data: for that values must have the structure of q, and no mode of '
+                "a Hybrid may have constraints."
             )
         levels_done: list[Descent] = []
         if self.method != "whole" and any(self.readers):
