@@ -47,7 +47,7 @@ class Density:
     ):  # fmt: skip
         self.residuals, self.shares, self.prior, self.point, self.noise = residuals, shares, prior, point, noise
         for part in residuals.parts:
-            if part.fits_on_constraints and (part.manifold.constrained or any(map(any, part.modes))):
+            if part.manifold and part.fits_on_constraints and (part.manifold.constrained or any(map(any, part.modes))):
                 raise ValueError(
                     "There is no density for fitted starts on constraints, or on closed contacts: give "
                     "start=(q0, qdot0)."

@@ -244,7 +244,8 @@ class Manifold:
             params = scene_params(numbers, table)
             if scene.touches:
                 return _project_onto_contacts(scene, layout, y, t, params, held)
-            q, qdot = scene.project(*map(layout.restore, halves(y)), t, params)
+            q, qdot = map(layout.restore, halves(y))
+            q, qdot = scene.project(q, qdot, t, params)
             return jnp.concatenate([layout.flatten(q), layout.flatten(qdot)])
 
         def measure(y, t, numbers, table, noise):

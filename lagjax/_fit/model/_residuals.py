@@ -217,7 +217,7 @@ class SystemResiduals:
             t, inputs = self._first_samples()
             each = (x[some] for x in (starts, t, numbers, directions, inputs))
             modes = [mode for mode, fitted in zip(self.modes, some, strict=True) if fitted]
-            consistent = self.manifold.project(*each, modes)
+            consistent = self.manifold.project(*each, modes=modes)
             starts[some], tangents[some], starts_dot[some] = consistent
             if (lost := ~np.isfinite(starts).all(axis=1)).any():
                 raise self.lost(np.argmax(lost), "No start near the one that was tried satisfies the constraints.")
@@ -446,9 +446,8 @@ class Residuals:
         self.pieces, self.fitted = pieces, fitted
         self.motions = np.arange(len(self.records)) if motions is None else motions
         firsts = {piece.record: row for row, piece in enumerate(pieces) if piece.places[0] == 0}
-        begins = [firsts.get(self.motions[piece.record], row) for row, piece in enumerate(pieces)]
-        leads = (row if piece.places[0] else begins[row] for row, piece in enumerate(pieces))
-        self.leads = np.array(list(leads))
+        owners = [self.motions[piece.record] if piece.places[0] == 0 else None for piece in pieces]
+        self.leads = np.array([firsts.get(owner, row) for row, owner in enumerate(owners)])
         self.own_starts = fitted & (self.leads == np.arange(len(pieces)))
         self.states = max(system.states for system in systems)
         self.parts = self._split_by_system()

@@ -77,8 +77,8 @@ class Timings(MeasuredSignal):
             raise ValueError("direction is for functions: a transition, or a contact, has its own. Leave it at 0.")
         if self.start is None:
             raise TypeError(
-                "A lagjax.Timings needs a start: (q0, qdot0), lagjax.Guess(q0, qdot0), a function, or the lagjax.Record "
-                "of the same motion."
+                "A lagjax.Timings needs a start: (q0, qdot0), lagjax.Guess(q0, qdot0), a function, or the Record of "
+                "the same motion."
             )
         if isinstance(self.start, Record):
             if self.start.ts[0] != self.t0:
