@@ -446,7 +446,7 @@ class Residuals:
         self.pieces, self.fitted = pieces, fitted
         self.motions = np.arange(len(self.records)) if motions is None else motions
         firsts = {piece.record: row for row, piece in enumerate(pieces) if piece.places[0] == 0}
-        owners = [self.motions[piece.record] if piece.places[0] == 0 else None for piece in pieces]
+        owners = [self.motions[piece.record] if piece.places[0] == 0 else -1 for piece in pieces]
         self.leads = np.array([firsts.get(owner, row) for row, owner in enumerate(owners)])
         self.own_starts = fitted & (self.leads == np.arange(len(pieces)))
         self.states = max(system.states for system in systems)
