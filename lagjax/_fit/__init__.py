@@ -118,7 +118,8 @@ def fit(
     - `method`: "whole" begins with whole records. "segments" begins with short segments of them, each with a start of
       its own read off the data, and joins these step by step; for that the signals must have the structure of q. "auto"
       does so where the signals allow it and the records are longer than the motion's time scale: then the search
-      converges for long and chaotic records, and from parameters that are far off. Where signals are no positions and
+      converges for long and chaotic records, and from parameters that are far off. Of motion that jumps it follows
+      whole records first, and where these leave motion, long ones by segments, each from its likeliest mode. Where signals are no positions and
       all starts are known, a search that leaves more than a twentieth of the signals is tried again from the first
       samples of the records, and the likelier of both is taken. Of hundreds of records an even sample is searched
       before all of them. "gradient" descends by reverse-mode
