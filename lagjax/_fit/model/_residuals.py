@@ -166,7 +166,7 @@ class SystemResiduals:
             if k in self.clocks:
                 record = self.records[k]
                 weights, values = record.weight_matrix[None], np.nan_to_num(record.matrix)[None]
-                inputs = np.zeros((1, len(record), 0))
+                inputs = np.zeros((1, len(record), 0 if self.signals.form is None else self.signals.form.size))
                 found.append(Samples(np.array([row]), values[..., 0], values, weights, inputs, None))
         for k, batch in enumerate(found):
             columns = self.columns(self.pieces[batch.rows[0]].record)
