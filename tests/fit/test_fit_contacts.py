@@ -20,6 +20,33 @@ BALL = lagjax.System(
     contacts=lambda q: {"floor": q},
     restitution=lambda params: params["e"],
 )
+SHAKING = lagjax.System(
+    lambda q, v, params: 0.5 * v**2 - params["g"] * q,
+    contacts=lambda q, t, params: q - params["a"] * jnp.sin(10 * np.pi * t),
+    restitution=lambda params: params["e"],
+)
+
+
+def swing(q, v, params):
+    return 0.5 * v**2 - 0.5 * params["k"] * q**2
+
+
+DRIVEN = {
+    "forces": lambda q, v, t: jnp.cos(2.8 * t),
+    "dissipation": lambda q, v, params: 0.5 * params["c"] * v**2,
+}
+STOPPED = lagjax.Hybrid(
+    {
+        "free": lagjax.System(swing, **DRIVEN),
+        "touching": lagjax.System(lambda q, v, params: swing(q, v, params) - 0.5 * params["s"] * q**2, **DRIVEN),
+    },
+    [
+        lagjax.Transition("free", "touching", lambda q, v: q, 1),
+        lagjax.Transition("touching", "free", lambda q, v: q, -1),
+    ],
+    "free",
+    max_transitions=128,
+)
 BOUNDED = {"g": lagjax.positive, "a": lagjax.positive, "e": lagjax.between(0.0, 1.0)}
 
 
@@ -81,15 +108,10 @@ def test_a_record_that_times_begin_with_must_be_there_and_begin_then():
 @pytest.mark.slow
 def test_a_ball_that_forgets_its_start_on_a_shaking_table_is_fitted_in_pieces():
     """Motions that begin side by side part by 1e8: no single start follows the record."""
-    table = lagjax.System(
-        lambda q, v, params: 0.5 * v**2 - params["g"] * q,
-        contacts=lambda q, t, params: q - params["a"] * jnp.sin(10 * np.pi * t),
-        restitution=lambda params: params["e"],
-    )
     truth, ts = {"g": 9.81, "a": 0.03, "e": 0.7}, np.linspace(0.0, 9.0, 1801)
-    motion = lagjax.simulate(table, 0.1, 0.0, ts, truth)
+    motion = lagjax.simulate(SHAKING, 0.1, 0.0, ts, truth)
     record = lagjax.Record(ts, noisy(motion.q, 2e-4), start=lagjax.Guess(0.1, 0.0))
-    fit = lagjax.fit(table, record, {"g": 10.5, "a": 0.026, "e": 0.6}, transforms=BOUNDED)
+    fit = lagjax.fit(SHAKING, record, {"g": 10.5, "a": 0.026, "e": 0.6}, transforms=BOUNDED)
     assert fit.ok and "pieces" in fit.message and int(motion.impacts.count) > 25
     assert_truth_in_intervals(fit, truth)
 
@@ -97,29 +119,9 @@ def test_a_ball_that_forgets_its_start_on_a_shaking_table_is_fitted_in_pieces():
 @pytest.mark.slow
 def test_a_chaotic_oscillator_with_a_stop_is_fitted_in_pieces_that_begin_in_their_modes():
     """Free for q < 0, against a stiff spring for q > 0."""
-
-    def law(q, v, params):
-        return 0.5 * v**2 - 0.5 * params["k"] * q**2
-
-    parts = {
-        "forces": lambda q, v, t: jnp.cos(2.8 * t),
-        "dissipation": lambda q, v, params: 0.5 * params["c"] * v**2,
-    }
-    scene = lagjax.Hybrid(
-        {
-            "free": lagjax.System(law, **parts),
-            "touching": lagjax.System(lambda q, v, params: law(q, v, params) - 0.5 * params["s"] * q**2, **parts),
-        },
-        [
-            lagjax.Transition("free", "touching", lambda q, v: q, 1),
-            lagjax.Transition("touching", "free", lambda q, v: q, -1),
-        ],
-        "free",
-        max_transitions=128,
-    )
     truth, ts = {"k": 1.0, "c": 0.05, "s": 100.0}, np.linspace(0.0, 80.0, 1601)
-    record = lagjax.Record(ts, noisy(lagjax.simulate(scene, -0.2, 0.0, ts, truth).q, 5e-3))
+    record = lagjax.Record(ts, noisy(lagjax.simulate(STOPPED, -0.2, 0.0, ts, truth).q, 5e-3))
     first = {"k": 1.2, "c": 0.04, "s": 120.0}
-    fit = lagjax.fit(scene, record, first, transforms=lagjax.positive, method="segments")
+    fit = lagjax.fit(STOPPED, record, first, transforms=lagjax.positive, method="segments")
     assert fit.ok
     assert_truth_in_intervals(fit, truth)

@@ -204,7 +204,7 @@ def read_start(reader: Reader | None, record: Any, part: SystemResiduals, called
 
 
 def start_noise(residuals: Residuals, readers: list[Reader | None], point: Point) -> np.ndarray:
-    """How far the starts (N, 2n) of the pieces may be off; what a record says of them is exact, to rounding."""
+    """The noise of the starts (N, 2n) of the pieces; what a record says of them is exact, to rounding."""
     noise = _ROUNDED * np.max(np.abs(point.starts), axis=1, keepdims=True) + np.zeros_like(point.starts)
     for row, (own, places, _) in enumerate(residuals.pieces):
         record = residuals.motions[own]
