@@ -119,11 +119,10 @@ def fit(
       its own read off the data, and joins these step by step; for that the signals must have the structure of q. "auto"
       does so where the signals allow it and the records are longer than the motion's time scale: then the search
       converges for long and chaotic records, and from parameters that are far off. Of motion that jumps it follows
-      whole records first, and where these leave motion, long ones by segments, each from its likeliest mode. Where signals are no positions and
-      all starts are known, a search that leaves more than a twentieth of the signals is tried again from the first
-      samples of the records, and the likelier of both is taken. Of hundreds of records an even sample is searched
-      before all of them. "gradient" descends by reverse-mode
-      gradients with optax's Adam: for scenes with neural terms, an `equinox.nn.MLP` in `params0` for instance. With
+      whole records first, and where these leave motion, long ones by segments, each from its likeliest mode. Where
+      signals are no positions and all starts are known, a search that leaves more than a twentieth of the signals is
+      tried again from the first samples of the records, and the likelier of both is taken. Of hundreds of records an
+      even sample is searched before all of them. "gradient" descends by reverse-mode gradients with optax's Adam: for scenes with neural terms, an `equinox.nn.MLP` in `params0` for instance. With
       more than a hundred free numbers the other methods say in a warning that this one is meant for them.
 
     Of a law of candidate terms (`lagjax.terms`) in `params0` those are 0 that the motion does not ask for.
