@@ -46,7 +46,7 @@ from lagjax._fit.result._selection import Selection, keep_selected, select_terms
 from lagjax._fit.result._verdict import is_doubtful
 from lagjax._fit.search._descent import Descent
 from lagjax._fit.search._multistart import Waterfall, run_multistart
-from lagjax._fit.search._reader import TimeScales, first_starts, read_records, time_scales
+from lagjax._fit.search._reader import TimeScales, first_starts, read_records, start_noise, time_scales
 from lagjax._fit.search._search import Search, search_again
 from lagjax._fit.search._unexplained import Unexplained, measure_unexplained
 from lagjax._primitives import with_doubles
@@ -120,12 +120,13 @@ def fit(
     - `method`: "whole" begins with whole records. "segments" begins with short segments of them, each with a start of
       its own read off the data, and joins these step by step; for that the signals must have the structure of q. "auto"
       does so where the signals allow it and the records are longer than the motion's time scale: then the search
-      converges for long and chaotic records, and from parameters that are far off. Where signals are no positions and
-      all starts are known, a search that leaves more than a twentieth of the signals is tried again from the first
-      samples of the records, and the likelier of both is taken. Of hundreds of records an even sample is searched
-      before all of them. "gradient" descends by reverse-mode
-      gradients with optax's Adam: for scenes with neural terms, an `equinox.nn.MLP` in `params0` for instance. With
-      more than a hundred free numbers the other methods say in a warning that this one is meant for them.
+      converges for long and chaotic records, and from parameters that are far off. Of motion that jumps it follows
+      whole records first, and where these leave motion, long ones by segments, each from its likeliest mode. Where
+      signals are no positions and all starts are known, a search that leaves more than a twentieth of the signals is
+      tried again from the first samples of the records, and the likelier of both is taken. Of hundreds of records an
+      even sample is searched before all of them. "gradient" descends by reverse-mode gradients with optax's Adam: for
+      scenes with neural terms, an `equinox.nn.MLP` in `params0` for instance. With hundreds of free numbers the other
+      methods say in a warning that this one is meant for them.
 
     Of a law of candidate terms (`lagjax.terms`) in `params0` those are 0 that the motion does not ask for.
     Intervals take the correlation of residuals into account (`Fit.noise`). `Fit.unseen` says in words which parameters
@@ -230,6 +231,8 @@ class _FitSearch(NamedTuple):
         readers = read_records(residuals)
         u = parameters.inverse(parameters.first)
         point, waterfall = Point(u, first_starts(residuals, readers, self.params0)), None
+        if any(jumps(part.scene) for part in residuals.parts):
+            residuals = residuals.choose_modes(point, start_noise(residuals, readers, point))
         residuals, point = _keep_unused(residuals, point)
         residuals = begin_weakly(residuals, point, self.law)
         if self.progress:
@@ -249,6 +252,7 @@ class _FitSearch(NamedTuple):
         """The end of the search from the starts that were asked for; where that is left to it, from one, and from more
         if that one is not enough: of learned functions, which have one least for a smoothness, evidence says so later.
         Raises `LostMotion` where none can be followed."""
+        whole = Search(residuals, self.law, "whole", search.readers) if self.method == "auto" else search
         tell, lost, chooses = _print_line if self.progress else None, None, looks_further and self.starts is None
         chooses &= len(residuals.parameters) > 0 and any(jumps(part.scene) for part in residuals.parts)
         chooses &= not residuals.parameters.prior_weights.any()
@@ -266,7 +270,7 @@ class _FitSearch(NamedTuple):
                 tell(f"One start is not enough, others are tried: {lost or 'the motion may be another one.'}")
             begin, seed = point if done is None else done.trial.point, [self.seed, len(misfits)]
             try:
-                other, some = run_multistart(residuals, search, begin, _STARTS_AT_A_TIME, seed, tell)
+                other, some = run_multistart(residuals, whole, begin, _STARTS_AT_A_TIME, seed, tell)
             except LostMotion:
                 text = f"{lost} Nor could the motions from {_STARTS_AT_A_TIME - 1} other starts be followed."
                 raise LostMotion(text) from None
@@ -320,8 +324,10 @@ class _FitSearch(NamedTuple):
 
 def _keep_unused(residuals: Residuals, point: Point) -> tuple[Residuals, Point]:
     """The residuals and the point where numbers of records on which the signals of their system do not depend at all,
-    but those of others do, stay as they are: the offset of a sensor that one of two machines has."""
+    but those of others do, stay as they are: the offset of a sensor that one of two machines has; so do those of a
+    record whose motion is that of another."""
     states, unknowns, kept = residuals.states, residuals.unknowns, np.zeros(len(residuals.parameters), bool)
+    kept[np.setdiff1d(np.arange(len(kept)), unknowns.columns)] = True
     if unknowns.own and len(residuals.parts) > 1:
         with contextlib.suppress(LostMotion):
             own = (x[..., states : states + unknowns.own].any(axis=(0, 1, 2)) for x in residuals.evaluate(point).slopes)

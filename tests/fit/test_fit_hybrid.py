@@ -138,7 +138,6 @@ def heard(section, times=(0.5, 1.0), **options):
 @pytest.mark.parametrize(
     ("system", "records", "options", "sentence"),
     [
-        (BALL, FALLS, {"method": "segments"}, "cannot cut hybrid motion"),
         (
             BALL,
             FALLS,

@@ -1,6 +1,7 @@
 """Assembly: the residuals of scenes and records as the user gives them, all of it checked."""
 
 import contextlib
+import functools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -22,12 +23,13 @@ from lagjax._fit.model._residuals import Residuals, SystemResiduals
 from lagjax._fit.model._sensor_faults import constant_signals, require_measurements
 from lagjax._fit.model._sensors import Delayed, require_no_jumps, sensors
 from lagjax._fit.model._signals import Signals
-from lagjax._fit.model._timings import Timings, build_clock
+from lagjax._fit.model._timings import Clock, Timings, build_clock
 from lagjax._interface import Layout, find_params_expression
 from lagjax._primitives import DOUBLE
 from lagjax._run.hybrid import Scene, first_law, jumps, require_scene
 
 PyTree = Any
+_HOLDING = "constraints", "contacts", "one_way", "slip"  # the ends of roles of functions that hold a start
 
 
 class GivenSystem(NamedTuple):
@@ -53,11 +55,14 @@ def read_systems(system, records, params0: PyTree, observe, hold: str) -> list[G
 
 def assemble_residuals(given: list[GivenSystem], parameters: Parameters, law: AbstractNoise) -> Residuals:
     """The residuals of all systems. Raises `ValueError` for records that no motion of a scene can have."""
-    systems = []
+    systems, motions = [], []
     for one in given:
         with errors_of_system(one.name):
             systems.append(_assemble_system(one, parameters, law))
-    return Residuals(systems, parameters)
+        first = len(motions)
+        places = {id(record): first + k for k, record in enumerate(one.records)}
+        motions += [places.get(id(record.start), first + k) for k, record in enumerate(one.records)]
+    return Residuals(systems, parameters.select(motions), motions=np.array(motions))
 
 
 def _assemble_system(given: GivenSystem, parameters: Parameters, law: AbstractNoise) -> SystemResiduals:
@@ -79,16 +84,16 @@ def _assemble_system(given: GivenSystem, parameters: Parameters, law: AbstractNo
     every = np.concatenate([record.matrix for record in recordings]) if recordings else np.zeros((1, 0))
     size = np.sqrt(np.nanmean(every**2, axis=0))  # root mean squares
     timings = {k: record for k, record in enumerate(records) if isinstance(record, Timings)}
-    clocks = {k: build_clock(system, layout, parameters, record, DEFAULT_RTOL) for k, record in timings.items()}
+    clocks = {k: _build_clock(given, parameters, record) for k, record in timings.items()}
     if timings:
         size = np.append(size, max(np.ptp(record.ts) for record in timings.values()))
         sensor = Sensor(*(np.append(x, np.nan) for x in sensor))
-    fitted = np.array([record.start is None or isinstance(record.start, Guess) for record in records])
+    fitted = np.array([record.begins is None or isinstance(record.begins, Guess) for record in records])
     manifold, scene = None, first_law(system)
     if jumps(system) and isinstance(observe, Delayed):
         raise ValueError("Sensors of contacts and hybrid motion cannot be lagjax.Delayed: shift the times instead.")
     asking = input_functions(scene)
-    if has_constraints(scene) and not any(role.endswith("constraints") for role in asking):
+    if (has_constraints(scene) or scene.touches) and not any(role.endswith(_HOLDING) for role in asking):
         manifold = Manifold(scene, layout, parameters, motions.projection, form if asking else None)
     elif has_constraints(scene) and fitted.any():
         raise ValueError("A start on constraints that ask for `inputs` cannot be fitted: give start=(q0, qdot0).")
@@ -98,6 +103,18 @@ def _assemble_system(given: GivenSystem, parameters: Parameters, law: AbstractNo
     )  # fmt: skip
 
 
+def _build_clock(given: GivenSystem, parameters: Parameters, timings: Timings) -> Clock:
+    """The clock of timings, with the inputs of the record of the same motion."""
+    scene, restore, record = given.system, parameters.restore, timings.start
+    if given.form is not None and isinstance(record, Record):
+        bind = functools.partial(given.form.bind_samples, ts=record.sampled_at, inputs=record.input_samples)
+        scene, restore = (
+            bind(scene, restore(parameters.example))[0],
+            lambda x: bind(given.system, parameters.restore(x))[1],
+        )
+    return build_clock(scene, given.layout, restore, restore(parameters.example), timings, DEFAULT_RTOL)
+
+
 def _require_motion(given: GivenSystem, recordings: list[Record], signals: Signals) -> None:
     """Raise `ValueError` where signals, but of hybrid motion, jump by a period, or where starts are fitted to rest."""
     of_state, wrap = sensors(given.observe)
@@ -105,14 +122,15 @@ def _require_motion(given: GivenSystem, recordings: list[Record], signals: Signa
         if isinstance(record, Record) and not jumps(given.system) and wrap is None:
             require_no_jumps(record, f"records[{place}]", signals.names, of_state is None)
     still = constant_signals(recordings, signals.names)
-    if len(still) == len(signals.names) * len(given.records) > 0 and all(one.start is None for one in given.records):
+    if len(still) == len(signals.names) * len(given.records) > 0 and all(one.begins is None for one in given.records):
         raise ValueError(f"{still[0]} So it is with all signals of all records: nothing moves that could be fitted.")
 
 
 def _read_form(system: Scene, records: list[Record], hold: str) -> InputForm | None:
     asking = input_functions(system)
     for place, record in enumerate(records):
-        if asking and (not isinstance(record, Record) or record.input_structure is None):
+        motion = record.start if isinstance(record.start, Record) else record
+        if asking and (not isinstance(motion, Record) or motion.input_structure is None):
             none = f"which records[{place}] has none of: give Record(..., inputs=...)."
             raise ValueError(f"{asking[0]} asks for `inputs`, {none}")
     structures = [record.input_structure for record in records if isinstance(record, Record)]
@@ -126,11 +144,12 @@ def _read_form(system: Scene, records: list[Record], hold: str) -> InputForm | N
 
 def _read_layout(system: Scene, records: list[Record], params0, form: InputForm | None) -> Layout:
     """The structure of the coordinates: that of a start that a record gives, or else that of its values."""
-    place = next((k for k, record in enumerate(records) if record.start is not None), None)
+    place = next((k for k, record in enumerate(records) if record.begins is not None), None)
     if place is not None:
-        begun = start_pair(records[place].start, params0)
-    else:  # no record is of crossing times: those have starts
-        begun = 2 * (jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), records[0].values),)
+        begun = start_pair(records[place].begins, params0)
+    else:  # crossing times have starts, or are those of a record
+        values = next(record.values for record in records if isinstance(record, Record))
+        begun = 2 * (jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), values),)
     q, qdot = jax.tree.map(jnp.asarray, begun)
     scene, params = first_law(system), params0
     if form is not None:

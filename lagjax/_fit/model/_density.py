@@ -47,8 +47,11 @@ class Density:
     ):  # fmt: skip
         self.residuals, self.shares, self.prior, self.point, self.noise = residuals, shares, prior, point, noise
         for part in residuals.parts:
-            if part.fits_on_constraints:
-                raise ValueError("There is no density for fitted starts on constraints: give start=(q0, qdot0).")
+            if part.manifold and part.fits_on_constraints and (part.manifold.constrained or any(map(any, part.modes))):
+                raise ValueError(
+                    "There is no density for fitted starts on constraints, or on closed contacts: give "
+                    "start=(q0, qdot0)."
+                )
             if part.signals.delays is not None:
                 raise ValueError("There is no density for lagjax.Delayed sensors: keep the delay, and shift the times.")
         self.dtype = np.result_type(*(part.layout.dtype for part in residuals.parts))
@@ -59,11 +62,12 @@ class Density:
         dof = np.log(share / (1 - share)) if self.moves_dof else np.zeros(0)
         moves = np.zeros((len(residuals.pieces), residuals.states), bool)
         for part in residuals.parts:
-            moves[part.frame.rows, : part.states] = residuals.fitted[part.frame.rows, None]
+            moves[part.frame.rows, : part.states] = residuals.own_starts[part.frame.rows, None]
         free, starts = len(point.u), point.starts[moves]
         self.first = np.concatenate([point.u, starts, np.log(noise.sigma), dof])
         self.start_places = np.full(moves.shape, len(self.first))
         self.start_places[moves] = np.arange(free, free + len(starts))
+        self.start_places = self.start_places[residuals.leads]
         self.noise_places = slice(free + len(starts), free + len(starts) + len(noise.sigma))
         of_noise = [f"log σ of {name}" for name in residuals.names]
         of_noise += [f"ν of {name}" for name in residuals.names] * self.moves_dof
@@ -74,7 +78,7 @@ class Density:
         layouts = {row: part.layout for part in residuals.parts for row in part.frame.rows.tolist()}
         return [
             f"starts{residuals.label(residuals.pieces[row].record).removeprefix('records')}.{half}{name[1:]}"
-            for row in np.flatnonzero(residuals.fitted).tolist()
+            for row in np.flatnonzero(residuals.own_starts).tolist()
             for half in ("q", "qdot")
             for name in layouts[row].names
         ]

@@ -7,10 +7,10 @@ directions over the steps of the motion, without a program of XLA, so that anoth
 nothing; other engines and hybrid motion go through `jax.jvp` of `simulate`, the plain path that this one is tested
 against.
 
-**Starts.** `Origins` are those that are functions of the parameters, `Manifold` those on constraints. On constraints a
-start has fewer directions than numbers. The unknown is any state y near them, and the motion begins at the consistent
-state P(y) nearest to it (`System.project`): what a step of the search leaves of the constraints is taken back, its
-derivative is that along them, and a direction across them changes nothing.
+**Starts.** `Origins` are those that are functions of the parameters, `Manifold` those on constraints, and on contacts
+that are closed. There a start has fewer directions than numbers. The unknown is any state y near them, and the motion
+begins at the consistent state P(y) nearest to it (`System.project`): what a step of the search leaves of the
+constraints is taken back, its derivative is that along them, and a direction across them changes nothing.
 """
 
 import abc
@@ -25,6 +25,7 @@ import numpy as np
 
 from lagjax._engine import Problem, Solution, choose
 from lagjax._engine.taylor import Flow, MachineCode, Motions, flow_of, jvp, project_start_tangents, tolerances_of
+from lagjax._equations import has_constraints
 from lagjax._fit.model._inputs import InputForm, SampleTable, constant_tables, input_functions
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import start_pair
@@ -32,8 +33,8 @@ from lagjax._interface import ENDED_WELL, Layout, halves
 from lagjax._native import Projection
 from lagjax._primitives import sentence
 from lagjax._run import simulate
-from lagjax._run.hybrid import Scene, first_law, jumps
-from lagjax._scene import DrivenParams, System
+from lagjax._run.hybrid import Scene, begin_in, first_law, jumps
+from lagjax._scene import ContactParams, Contacts, ContactScene, DrivenParams, FlatContacts, System
 
 PyTree = Any
 
@@ -72,11 +73,12 @@ class AbstractMotions(abc.ABC):
     @abc.abstractmethod
     def follow(
         self, ts: np.ndarray, y0: np.ndarray, numbers: np.ndarray, y0_dot: np.ndarray, numbers_dot: np.ndarray,
-        table: SampleTable | None = None, known: Solution | None = None,
+        table: SampleTable | None = None, modes: np.ndarray | None = None, known: Solution | None = None,
     ) -> RecordMotion:  # fmt: skip
         """The motions from `y0` (N, 2n) at `ts` (N, T), with parameters `numbers` (N, P) and a table of inputs a row.
 
-        Tangents go along `y0_dot` (N, D, 2n) and `numbers_dot` (N, D, P); their solution may be `known`.
+        Tangents go along `y0_dot` (N, D, 2n) and `numbers_dot` (N, D, P); their solution may be `known`. Hybrid motions
+        begin in the `modes` (N,).
         """
 
     @abc.abstractmethod
@@ -116,7 +118,7 @@ class _MachineCodeMotions(AbstractMotions):
             return flow_of(self.problem(2)), numbers
         return flow_of(self.problem(table.room)), table.rows(numbers)
 
-    def follow(self, ts, y0, numbers, y0_dot, numbers_dot, table=None, known=None):
+    def follow(self, ts, y0, numbers, y0_dot, numbers_dot, table=None, modes=None, known=None):
         flow, params = self._flow(numbers, table)
         run = known or flow.run(ts, y0, params, self.tolerances)
         if not y0_dot.shape[1] or not np.isin(run.result, ENDED_WELL).all():  # a lost motion needs no tangents
@@ -149,8 +151,8 @@ class _JaxMotions(AbstractMotions):
             self._follow, self._rate = _programs_once.__wrapped__(*key)
         self.dtype = layout.dtype
 
-    def follow(self, ts, y0, numbers, y0_dot, numbers_dot, table=None, known=None):
-        arrays = jax.tree.map(self._array, (ts, y0, numbers, y0_dot, numbers_dot, table))
+    def follow(self, ts, y0, numbers, y0_dot, numbers_dot, table=None, modes=None, known=None):
+        arrays = *jax.tree.map(self._array, (ts, y0, numbers, y0_dot, numbers_dot, table)), modes
         (path, result, t_end, y_end), tangents = jax.tree.map(np.asarray, self._follow(*arrays))
         return RecordMotion(path.astype(float), tangents.astype(float), result, t_end, y_end)
 
@@ -171,20 +173,22 @@ def _programs_once(scene: Scene, layout: Layout, tree, leaves: tuple, options: t
         params = restore(numbers)
         return DrivenParams(params, table) if is_driven else params
 
-    def run(state, ts, table):
+    def run(state, ts, table, mode):
         y0, numbers = state
         q, qdot = map(layout.restore, halves(y0))
-        trajectory = simulate(scene, q, qdot, ts, scene_params(numbers, table), throw=False, **dict(options))
+        trajectory = simulate(
+            begin_in(scene, mode), q, qdot, ts, scene_params(numbers, table), throw=False, **dict(options)
+        )
         rows = jax.vmap(lambda q, v: jnp.concatenate([layout.flatten(q), layout.flatten(v)]))
         end = jnp.concatenate([layout.flatten(trajectory.end.q), layout.flatten(trajectory.end.qdot)])
         path = rows(trajectory.q, trajectory.qdot)
         return path, (path, trajectory.result._value, trajectory.end.t, end)
 
-    def run_with_tangents(ts, y0, numbers, y0_dot, numbers_dot, table):
+    def run_with_tangents(ts, y0, numbers, y0_dot, numbers_dot, table, mode):
         def tangent(*dot):
-            return jax.jvp(lambda state: run(state, ts, table)[0], ((y0, numbers),), (dot,))[1]
+            return jax.jvp(lambda state: run(state, ts, table, mode)[0], ((y0, numbers),), (dot,))[1]
 
-        return run((y0, numbers), ts, table)[1], jax.vmap(tangent)(y0_dot, numbers_dot)
+        return run((y0, numbers), ts, table, mode)[1], jax.vmap(tangent)(y0_dot, numbers_dot)
 
     def rate(t, y, numbers, table):
         q, qdot = map(layout.restore, halves(y))
@@ -193,6 +197,7 @@ def _programs_once(scene: Scene, layout: Layout, tree, leaves: tuple, options: t
     return jax.jit(jax.vmap(run_with_tangents)), jax.jit(jax.vmap(rate))
 
 
+_DEEP = 1e-9  # times the largest number of a state: of gaps that are negative by more than rounding
 _STEPS, _STILL = 30, 1e-13  # of Newton's method, which squares the distance; and the change at which it has ended
 
 
@@ -225,7 +230,11 @@ class Origins:
 
 class Manifold:
     """The states that satisfy the constraints of a scene: by the projection of its machine code, else by `project`. The
-    first, a step of Newton's method that is taken until nothing changes, needs no compilation."""
+    first, a step of Newton's method that is taken until nothing changes, needs no compilation.
+
+    Of a scene with contacts those where the gaps that are closed stay zero, what sticks is at rest, and the other gaps
+    are not negative.
+    """
 
     def __init__(
         self, system: System, layout: Layout, parameters: Parameters, projection: Projection | None,
@@ -234,31 +243,102 @@ class Manifold:
         """`form` is that of the inputs of a scene that asks for them, but not in its constraints."""
         scene = system if form is None else form.drive_system(system)
 
-        def project(y: jax.Array, t, numbers, table) -> jax.Array:
-            q, qdot = map(layout.restore, halves(y))
+        def scene_params(numbers, table):
             params = parameters.restore(numbers)
-            q, qdot = scene.project(q, qdot, t, params if form is None else DrivenParams(params, table))
+            return params if form is None else DrivenParams(params, table)
+
+        def project(y: jax.Array, t, numbers, table, held) -> jax.Array:
+            params = scene_params(numbers, table)
+            if scene.touches:
+                return _project_onto_contacts(scene, layout, y, t, params, held)
+            q, qdot = map(layout.restore, halves(y))
+            q, qdot = scene.project(q, qdot, t, params)
             return jnp.concatenate([layout.flatten(q), layout.flatten(qdot)])
+
+        def measure(y, t, numbers, table, noise):
+            params = scene_params(numbers, table)
+
+            def values(y):
+                return _contact_values(FlatContacts.from_system(scene, layout, params), y, t, params)
+
+            reach = jax.tree.map(
+                lambda slopes: jnp.sqrt((slopes * noise) ** 2 @ jnp.ones(y.size)), jax.jacfwd(values)(y)
+            )
+            return values(y), reach
 
         def project_with_derivatives(*arguments):
             return project(*arguments), *jax.jacfwd(project, argnums=(0, 2))(*arguments)
 
         self._project = jax.jit(project_with_derivatives)  # one by one: compilation for many rows takes seconds
-        self.projection, self.dtype = projection, layout.dtype
+        self._measure, self.touches, self.constrained = jax.jit(measure), scene.touches, has_constraints(scene)
+        self.projection, self.dtype = None if scene.touches else projection, layout.dtype
 
     def project(
-        self, y: np.ndarray, t: np.ndarray, numbers: np.ndarray, directions: np.ndarray, inputs: np.ndarray
+        self, y: np.ndarray, t: np.ndarray, numbers: np.ndarray, directions: np.ndarray, inputs: np.ndarray, modes: list
     ) -> tuple:
         """Consistent states near `y` (N, 2n) at the times `t` (N,), NaN without one, with their derivatives by y (N,
         2n, 2n) and along directions (N, L, P) of the parameters (N, P), which are (N, L, 2n); `inputs` (N, I) are those
-        at these times."""
+        at these times, `modes` those of the pieces."""
         if self.projection is not None:
             return _project_by_newton(self.projection, y, t, numbers, directions)
-        table = constant_tables(t, inputs)
-        y, t, numbers, *table = (np.asarray(x, self.dtype) for x in (y, t, numbers, *table))
-        rows = [self._project(*row, SampleTable(k, v)) for *row, k, v in zip(y, t, numbers, *table, strict=True)]
+        rows = []
+        for row, mode in zip(self._rows(y, t, numbers, inputs), modes, strict=True):
+            held = np.zeros(0)
+            if self.touches:
+                (gaps, _, rough), _ = self._measure(*row, np.zeros_like(row[0]))
+                held = np.array(mode or (0,) * (len(gaps) + len(rough)), float)
+                if not (self.constrained or held.any() or (np.asarray(gaps) < 0).any()):
+                    rows.append((row[0], np.eye(y.shape[1]), np.zeros((y.shape[1], numbers.shape[1]))))
+                    continue
+            rows.append(self._project(*row, held))
         starts, by_y, by_numbers = (np.stack([np.asarray(x, float) for x in part]) for part in zip(*rows, strict=True))
         return starts, by_y, np.einsum("nip,nlp->nli", by_numbers, directions)
+
+    def possible_modes(self, y, t, numbers, inputs, noise: np.ndarray) -> list[list[tuple[int, ...]]]:
+        """The modes (see `Piece`) that states `y` (N, 2n) may have within their `noise` (N, 2n): all contacts open,
+        those that may be closed closed, and all of these that may stick sticking."""
+        found = []
+        for row, near in zip(self._rows(y, t, numbers, inputs), noise, strict=True):
+            close = [np.abs(x) <= r for x, r in zip(*jax.tree.map(np.asarray, self._measure(*row, near)), strict=True)]
+            closed, sticks = (close[0] & close[1]).astype(int), close[2].all(axis=1).astype(int)
+            modes = [
+                np.append(c, s).tolist() for c, s in ((0, 0), (1, 0), (1, 1)) for c, s in [(c * closed, s * sticks)]
+            ]
+            found.append(list(dict.fromkeys(map(tuple, modes if closed.any() else modes[:1]))))
+        return found
+
+    def _rows(self, y, t, numbers, inputs):
+        table = constant_tables(t, inputs)
+        y, t, numbers, *table = (np.asarray(x, self.dtype) for x in (y, t, numbers, *table))
+        return [(*row, SampleTable(k, v)) for *row, k, v in zip(y, t, numbers, *table, strict=True)]
+
+
+def _contact_values(flat: FlatContacts, y: jax.Array, t, params) -> tuple:
+    """Gaps and one-way velocities (k,), the rates of gaps, zero for the others, and slips (r, d)."""
+    (q, v), kind = halves(y), y.dtype
+    gaps, rates = jax.jvp(lambda q, t: flat.gaps(q, t, params), (q, t), (v, jnp.ones((), kind)))
+    one_way = flat.one_way(q, v, t, params)
+    return jnp.append(gaps, one_way), jnp.append(rates, jnp.zeros_like(one_way)), flat.slips(q, v, t, params)
+
+
+def _project_onto_contacts(scene: System, layout: Layout, y: jax.Array, t, params, held: jax.Array) -> jax.Array:
+    """The state nearest to y where what is `held` (k + r,) stays, and no other gap is negative: these are opened
+    without a change of velocities. Of a gap that only rounding makes negative the derivatives are those of y."""
+    flat, (q, v) = FlatContacts.from_system(scene, layout, params), halves(y)
+    closed, sticks = jnp.split(held, [flat.shapes.count])
+    gaps = flat.gaps(q, t, params)
+
+    def nearest(q, v, closed):
+        inside = ContactParams(
+            params,
+            Contacts(closed, sticks, jnp.ones((sticks.size, flat.shapes.directions)), jnp.zeros(0), jnp.ones(())),
+        )
+        return ContactScene(scene)._motion(layout, inside).nearest_consistent(q, v, t, inside)
+
+    within, _ = nearest(q, v, closed.at[: gaps.size].max(gaps < 0))
+    found = jnp.concatenate(nearest(within, v, closed))
+    deep = held.any() | (gaps < -_DEEP * jnp.abs(y).max()).any() | has_constraints(scene)
+    return jnp.where(deep, found, y + jax.lax.stop_gradient(found - y))
 
 
 def _project_by_newton(projection: Projection, y: np.ndarray, t: np.ndarray, numbers: np.ndarray, directions) -> tuple:

@@ -9,10 +9,15 @@ from lagjax._fit.model._records import Record
 
 
 class Piece(NamedTuple):
-    """The samples `places` of the record `record`, followed as a motion of its own from the first of them."""
+    """The samples `places` of the record `record`, followed as a motion of its own from the first of them.
+
+    `mode` is what holds there: of hybrid motion (1,) the place of the mode, empty for that in which the scene begins;
+    of k contacts, r with friction, (k + r,): 1 for what is closed, then for what sticks; empty where none is closed.
+    """
 
     record: int
     places: np.ndarray
+    mode: tuple[int, ...] = ()
 
 
 def whole_pieces(records: list[Record]) -> list[Piece]:
@@ -59,7 +64,7 @@ def _stack_pieces(records: list[Record], pieces: list[Piece], rows: np.ndarray, 
     driven = matrices[pieces[rows[0]].record][2]
     inputs, sampled = np.zeros((len(rows), longest, driven.shape[1])), []
     for i, row in enumerate(rows):
-        record, places = pieces[row]
+        record, places, _ = pieces[row]
         measured, weight = (matrix[places] for matrix in matrices[record][:2])
         times, count = records[record].ts[places], len(places)
         # Eight units of round-off apart: times that still increase.

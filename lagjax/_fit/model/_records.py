@@ -41,6 +41,11 @@ class MeasuredSignal:
     matrix: np.ndarray
     weight_matrix: np.ndarray
 
+    @property
+    def begins(self) -> Any:
+        """The `start` of the motion, that of the record of the same motion where it is one."""
+        return self.start.start if isinstance(self.start, MeasuredSignal) else self.start
+
     def __len__(self) -> int:
         raise NotImplementedError
 
@@ -310,6 +315,10 @@ def require_records(records) -> list[Any]:
     for place, record in enumerate(listed):
         if not (record.weight_matrix > 0).any():
             raise ValueError(f"records[{place}] holds no sample: all its values are NaN or have no weight.")
+        if isinstance(record.start, MeasuredSignal) and record.start not in listed:
+            raise ValueError(
+                f"records[{place}] begins with a record that is not among `records`: give that one, the same object."
+            )
     return listed
 
 
@@ -340,9 +349,9 @@ def _require_same_signals(placed: list[tuple[int, Record]]) -> None:
 
 def known_start(record: MeasuredSignal, layout: Layout, place: int, params: PyTree) -> np.ndarray | None:
     """The state (2n,) that a record says it starts from, known, guessed or of `params`; None where it says nothing."""
-    if record.start is None:
+    if record.begins is None:
         return None
-    q, qdot = start_pair(record.start, params)
+    q, qdot = start_pair(record.begins, params)
     halves = [jax.tree.flatten(half) for half in (q, qdot)]
     if any(tree != layout.tree or tuple(map(np.shape, leaves)) != layout.shapes for leaves, tree in halves):
         own = Layout.from_state(q, qdot)

@@ -15,6 +15,7 @@ weight where a record does not have them.
 densities have their gradients: back over the steps of motions, where trials go forward along every unknown.
 """
 
+import contextlib
 import copy
 import functools
 import itertools
@@ -34,13 +35,13 @@ from lagjax._fit.model._motions import AbstractMotions, Manifold, Origins, Recor
 from lagjax._fit.model._noise import AbstractNoise, NoiseScale, Sensor, counts, log_likelihood, scores, worths
 from lagjax._fit.model._parameters import Parameters, Unknowns
 from lagjax._fit.model._pieces import Piece, Samples, batch_pieces, whole_pieces
-from lagjax._fit.model._records import start_pair
+from lagjax._fit.model._records import Guess, start_pair
 from lagjax._fit.model._sensors import wrap_residuals
 from lagjax._fit.model._signals import Signals
 from lagjax._fit.model._timings import Clock
 from lagjax._interface import Layout, halves
 from lagjax._run import simulate
-from lagjax._run.hybrid import Scene
+from lagjax._run.hybrid import Hybrid, Scene, begin_in
 from lagjax._scene import DrivenParams
 
 
@@ -73,6 +74,11 @@ class Trial(NamedTuple):
     def flat(self) -> np.ndarray:
         """The residuals of all batches, (M, S)."""
         return np.concatenate([r.reshape(-1, r.shape[-1]) for r in self.residuals])
+
+
+# Twice the log-likelihood by which an open contact must be likelier than a closed one where a record begins. At nodes a
+# contact that is held closed by mistake costs more: of 4, the pieces of a bouncing ball did not converge.
+_PLAINLY = 9.0
 
 
 class LostMotion(ValueError):
@@ -140,8 +146,9 @@ class SystemResiduals:
         self.least = self.rtol * self.size
         self.layout: Layout = self.signals.layout
         self.states = 2 * self.layout.size
-        starts = [self.records[piece.record].start if piece.places[0] == 0 else None for piece in self.pieces]
+        starts = [self.records[piece.record].begins if piece.places[0] == 0 else None for piece in self.pieces]
         self.origins = Origins(starts, self.layout, self.restore)
+        self.modes = [piece.mode for piece in self.pieces]
         self.fits_on_constraints = self.manifold is not None and bool(self.fitted.any())
 
     def with_records(self, records: list[Any], fitted: np.ndarray, manifold: Manifold | None = None):
@@ -164,11 +171,11 @@ class SystemResiduals:
         own, eps = [self.pieces[row] for row in sensed], float(np.finfo(self.layout.dtype).eps)
         some = batch_pieces(self.records, own, eps, "zero" if self.signals.form is None else self.signals.form.hold)
         found = [batch._replace(rows=np.array(sensed)[batch.rows]) for batch in some]
-        for row, (k, _) in enumerate(self.pieces):
+        for row, (k, *_) in enumerate(self.pieces):
             if k in self.clocks:
                 record = self.records[k]
                 weights, values = record.weight_matrix[None], np.nan_to_num(record.matrix)[None]
-                inputs = np.zeros((1, len(record), 0))
+                inputs = np.zeros((1, len(record), 0 if self.signals.form is None else self.signals.form.size))
                 found.append(Samples(np.array([row]), values[..., 0], values, weights, inputs, None))
         for k, batch in enumerate(found):
             columns = self.columns(self.pieces[batch.rows[0]].record)
@@ -209,7 +216,7 @@ class SystemResiduals:
         return f"records{'' if self.name is None else f'[{self.name!r}]'}[{record}]"
 
     def lost(self, row: Any, text: str) -> LostMotion:
-        record, places = self.pieces[row]
+        record, places, _ = self.pieces[row]
         begin = self.records[record].ts[places[0]]
         return LostMotion(f"The motion of {self.label(record)} from t = {begin:g} failed. {text}")
 
@@ -223,12 +230,10 @@ class SystemResiduals:
         if self.fits_on_constraints:
             assert self.manifold is not None and trial.across is not None
             some, tangents = self.fitted, np.tile(np.eye(states), (len(starts), 1, 1))
-            t = np.array([self.records[piece.record].ts[piece.places[0]] for piece in self.pieces])
-            inputs = np.zeros((len(starts), self.batches[0].inputs.shape[-1]))
-            for batch in self.batches:
-                inputs[batch.rows] = batch.inputs[:, 0]
+            t, inputs = self._first_samples()
             each = (x[some] for x in (starts, t, numbers, along, inputs))
-            consistent = self.manifold.project(*each)
+            modes = [mode for mode, fitted in zip(self.modes, some, strict=True) if fitted]
+            consistent = self.manifold.project(*each, modes=modes)
             starts[some], tangents[some], starts_dot[some] = consistent
             if (lost := ~np.isfinite(starts).all(axis=1)).any():
                 raise self.lost(np.argmax(lost), "No start near the one that was tried satisfies the constraints.")
@@ -240,16 +245,81 @@ class SystemResiduals:
         solutions = cast(list, trial.solutions)
         return _SystemTrial(numbers, directions, starts, tangents, starts_dot, known, solutions)
 
-    def _follow(self, batch: Samples, ts: np.ndarray, trial: _SystemTrial) -> RecordMotion:
-        """The motions of a trial at the times `ts` (N, T) of the pieces of a batch."""
+    def _follow(self, batch: Samples, ts: np.ndarray, trial: _SystemTrial, must: bool = True) -> RecordMotion:
+        """The motions of a trial at the times `ts` (N, T) of the pieces of a batch, which all `must` be followed."""
         y0_dot, numbers_dot = self._directions(batch, trial)
-        each = ts, trial.starts[batch.rows], trial.numbers[batch.rows], y0_dot, numbers_dot, batch.table
-        motion = self.motions.follow(*each, next(trial.known, None))
+        rows = batch.rows
+        given = ts, trial.starts[rows], trial.numbers[rows], y0_dot, numbers_dot, batch.table
+        motion = self.motions.follow(*given, self.first_modes(rows), next(trial.known, None))
         trial.solutions.append(motion.solution)
-        if not motion.ok:
+        if must and not motion.ok:
             row, text = motion.describe_failure(ts, self.layout)
             raise self.lost(batch.rows[row], text)
         return motion
+
+    # ---- the modes in which pieces begin ----
+
+    def choose_modes(self, trial: Trial, numbers, noise: np.ndarray) -> list[tuple[int, ...]]:
+        """The mode of each piece whose states are known to a `noise` (N, 2n): of those possible that which leaves the
+        least. A record says in which it begins where its start is a guess, or known."""
+        found = self._possible_modes(trial, numbers, noise)
+        most = max(map(len, found))
+        if most == 1:
+            return [modes[0] for modes in found]
+        left = np.full((most, len(found)), np.inf)
+        for k in range(most):
+            modes = [of[min(k, len(of) - 1)] for of in found]
+            pieces = [piece._replace(mode=mode) for piece, mode in zip(self.pieces, modes, strict=True)]
+            with contextlib.suppress(LostMotion):
+                left[k] = replace(self, pieces=pieces)._measure_left(trial, numbers)
+        if not isinstance(
+            self.scene, Hybrid
+        ):  # records begin at rest rather than with little hops; nodes may be anywhere
+            weight = [_PLAINLY / len(piece.places) * (piece.places[0] == 0) for piece in self.pieces]
+            left *= np.exp(-np.arange(most)[:, None] * weight)
+        return [of[min(k, len(of) - 1)] for of, k in zip(found, np.argmin(left, axis=0).tolist(), strict=True)]
+
+    def _possible_modes(self, trial: Trial, numbers, noise: np.ndarray) -> list[list[tuple[int, ...]]]:
+        found, begins = [[piece.mode] for piece in self.pieces], [piece.places[0] == 0 for piece in self.pieces]
+        rows = [row for row, piece in enumerate(self.pieces) if not piece.mode]
+        if isinstance(self.scene, Hybrid):
+            for row in rows:
+                found[row] = [()] if begins[row] else [(k,) for k in range(len(self.scene.modes))]
+        elif self.manifold is not None and self.manifold.touches:
+            t, inputs = self._first_samples()
+            given = trial.starts[self.frame.rows, : self.states], t, numbers, inputs, noise[self.frame.rows]
+            for row, modes in zip(rows, self.manifold.possible_modes(*(x[rows] for x in given)), strict=True):
+                start = self.records[self.pieces[row].record].begins if begins[row] else None
+                found[row] = modes if start is None else modes[-1:] if isinstance(start, Guess) else found[row]
+        return found
+
+    def _first_samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """The times (N,) at which the pieces begin, and the inputs (N, I) then."""
+        t = np.array([self.records[piece.record].ts[piece.places[0]] for piece in self.pieces])
+        inputs = np.zeros((len(t), self.batches[0].inputs.shape[-1]))
+        for batch in self.batches:
+            inputs[batch.rows] = batch.inputs[:, 0]
+        return t, inputs
+
+    def _measure_left(self, trial: Trial, numbers) -> np.ndarray:
+        """The sum of squares (N,) that the motion of each piece leaves, infinite for those that are lost."""
+        begun = self._begin_trial(trial._replace(starts=trial.starts.copy(), solutions=[]), numbers, None, iter(()))
+        left, sensed = np.full(len(self.pieces), np.inf), len(self.signals.names)
+        for batch in (one for one in self.batches if self.pieces[one.rows[0]].record not in self.clocks):
+            motion, numbers_dot = self._follow(batch, batch.ts, begun, must=False), self._directions(batch, begun)[1]
+            shown, _ = self.signals.evaluate(motion, batch.ts, batch.inputs, begun.numbers[batch.rows], numbers_dot)
+            columns = self.columns(self.pieces[batch.rows[0]].record)
+            weights, values = batch.weights[..., columns], batch.values[..., columns]
+            r = wrap_residuals(shown - values, self.frame.periods[columns]) / self.size[:sensed]
+            squares = np.sum(np.where(weights > 0, weights * r**2, 0.0), axis=(1, 2))
+            left[batch.rows] = np.where(np.isfinite(squares), squares, np.inf)
+        return left
+
+    def first_modes(self, rows: np.ndarray) -> np.ndarray | None:
+        """The places of the modes in which pieces begin; None where the scene has no modes."""
+        if not isinstance(self.scene, Hybrid):
+            return None
+        return np.array([self.modes[row][0] if self.modes[row] else self.scene.first for row in rows])
 
     def _directions(self, batch: Samples, trial: _SystemTrial) -> tuple[np.ndarray, np.ndarray]:
         """Directions of the starts (N, D, 2n) and of the parameters (N, D, P): D = 2n + L, or L where no start is
@@ -339,11 +409,11 @@ class SystemResiduals:
         form = signals.form if signals.form is not None and input_functions(self.scene) else None
         scene = self.scene if form is None else form.drive_scene(self.scene)
 
-        def sense(ts, y0, numbers, inputs, table):
+        def sense(ts, y0, numbers, inputs, table, mode):
             q, qdot = map(layout.restore, halves(y0))
             params = self.restore(numbers)
             own = params if form is None else DrivenParams(params, table)
-            motion = simulate(scene, q, qdot, ts, own, rtol=self.rtol, throw=False)
+            motion = simulate(begin_in(scene, mode), q, qdot, ts, own, rtol=self.rtol, throw=False)
             rows = jax.vmap(lambda q, v: jnp.concatenate([layout.flatten(q), layout.flatten(v)]))(motion.q, motion.qdot)
             return jax.vmap(lambda y, t, i: signals.evaluate_state(y, t, numbers, i))(rows, ts, inputs)
 
@@ -352,7 +422,7 @@ class SystemResiduals:
         if record in self.clocks:
             shown = self.clocks[record].times(starts[0], numbers[0])[None, :, None]
         else:
-            shown = jax.vmap(sense)(ts, starts, numbers, inputs, table)
+            shown = jax.vmap(sense)(ts, starts, numbers, inputs, table, self.first_modes(batch.rows))
         shown = jnp.zeros(values.shape, values.dtype).at[..., self.columns(record)].set(shown)
         return jnp.where(batch.weights > 0, wrap_residuals(shown - values, self.frame.periods, jnp), 0.0)
 
@@ -360,7 +430,7 @@ class SystemResiduals:
         """The starts (M, 2n) of all systems for JAX, of which some of this one are functions of the parameters (N, P)
         of its pieces."""
         for row, piece, own in zip(self.frame.rows, self.pieces, numbers, strict=True):
-            start = self.records[piece.record].start
+            start = self.records[piece.record].begins
             if callable(start) and piece.places[0] == 0:
                 flat = jnp.concatenate([self.layout.flatten(half) for half in start_pair(start, self.restore(own))])
                 starts = starts.at[row, : self.states].set(flat)
@@ -375,6 +445,8 @@ class Residuals:
       whole records.
     - `parts`: the systems that have pieces. `records`; `states`: the numbers of a start. `unknowns`: those of the N
       pieces.
+    - `motions` (R,): of every record the one of the same motion that has the start. `leads` (N,): of every piece that
+      which has it, `own_starts` (N,) whether it is its own, and free.
     - `names`, `size`, `least` (S,): signals, their root mean square, and the smallest noise that can be estimated.
     - `batches`: the samples, with a column for every signal; `weights` (M, S): all of theirs; `measured`: how many.
     - `watch` is called with every trial of `evaluate`.
@@ -387,6 +459,7 @@ class Residuals:
         pieces: list[Piece] | None = None,
         fitted: np.ndarray | None = None,
         watch: Callable[[Trial | LostMotion], None] | None = None,
+        motions: np.ndarray | None = None,
     ):
         self.systems, self.watch, self.parameters = list(systems), watch, parameters
         self.records = [record for system in systems for record in system.records]
@@ -394,9 +467,14 @@ class Residuals:
         self._records = [slice(*ends) for ends in itertools.pairwise(firsts)]
         if pieces is None or fitted is None:
             pairs = list(zip(firsts, self.systems, strict=False))
-            pieces = [Piece(k + piece.record, piece.places) for k, system in pairs for piece in system.pieces]
+            pieces = [piece._replace(record=k + piece.record) for k, system in pairs for piece in system.pieces]
             fitted = np.concatenate([system.fitted for system in systems])
         self.pieces, self.fitted = pieces, fitted
+        self.motions = np.arange(len(self.records)) if motions is None else motions
+        firsts = {piece.record: row for row, piece in enumerate(pieces) if piece.places[0] == 0}
+        owners = [self.motions[piece.record] if piece.places[0] == 0 else -1 for piece in pieces]
+        self.leads = np.array([firsts.get(owner, row) for row, owner in enumerate(owners)])
+        self.own_starts = fitted & (self.leads == np.arange(len(pieces)))
         self.states = max(system.states for system in systems)
         self.parts = self._split_by_system()
         heads = ["" if part.name is None else f"{part.name}: " for part in self.parts]
@@ -415,7 +493,8 @@ class Residuals:
         for system, records in zip(self.systems, self._records, strict=True):
             rows = np.flatnonzero((owner >= records.start) & (owner < records.stop))
             if len(rows):
-                own = [Piece(self.pieces[row].record - records.start, self.pieces[row].places) for row in rows]
+                pieces = [self.pieces[row] for row in rows]
+                own = [piece._replace(record=piece.record - records.start) for piece in pieces]
                 parts.append(replace(system, pieces=own, fitted=self.fitted[rows]))
                 places.append((rows, records))
         firsts = np.cumsum([0, *(len(part.names) for part in parts)]).tolist()
@@ -429,7 +508,25 @@ class Residuals:
 
     def with_pieces(self, pieces: list[Piece], fitted: np.ndarray) -> "Residuals":
         """The residuals of other pieces of the records; the signals are those of systems with a piece."""
-        return Residuals(self.systems, self.parameters, pieces, fitted, self.watch)
+        return Residuals(self.systems, self.parameters, pieces, fitted, self.watch, self.motions)
+
+    def choose_modes(self, point: Point, noise: np.ndarray) -> "Residuals":
+        """The same residuals, whose pieces begin in the likeliest modes; `noise` (N, 2n) is that of the starts."""
+        pieces, trial, owners = list(self.pieces), self._trial_at(point), [piece.record for piece in self.pieces]
+        numbers = self.parameters.numbers(point.u)
+        for part in self.parts:
+            rows = part.frame.rows
+            own = np.array(owners)[rows]
+            modes = part.choose_modes(trial, numbers[self.parameters.places[own]], noise)
+            for row, mode in zip(rows, modes, strict=True):
+                pieces[row] = pieces[row]._replace(mode=mode)
+        pieces = [piece._replace(mode=pieces[lead].mode) for piece, lead in zip(pieces, self.leads, strict=True)]
+        return self.with_pieces(pieces, self.fitted)
+
+    def _trial_at(self, point: Point) -> Trial:
+        constrained, square = any(part.fits_on_constraints for part in self.parts), (self.states, self.states)
+        across = np.zeros((len(point.starts), *square)) if constrained else None
+        return Trial(point.u, point.starts[self.leads], [], [], across, [])
 
     def with_parameters(self, parameters: Parameters) -> "Residuals":
         other = copy.copy(self)
@@ -451,9 +548,7 @@ class Residuals:
         if begun is not None and begun.slopes:
             return begun
         slopes |= not all(part.motions.splits and not part.clocks for part in self.parts)
-        constrained, square = any(part.fits_on_constraints for part in self.parts), (self.states, self.states)
-        across = np.zeros((len(point.starts), *square)) if constrained else None
-        trial = Trial(point.u, point.starts.copy(), [], [], across, [])
+        trial = self._trial_at(point)
         numbers, directions = self.parameters.numbers(point.u), self.parameters.directions(point.u) if slopes else None
         watch, owners = self.watch or (lambda _: None), np.array([piece.record for piece in self.pieces])
         known = iter(() if begun is None else begun.solutions)
@@ -548,7 +643,8 @@ class Residuals:
         return self.triangles(self.working_trial(point, noise), self.factors(point, noise))
 
     def triangles(self, point: Trial, factors: list[np.ndarray]) -> np.ndarray:
-        """The weighted rows of each piece, compressed: (N, D + 1, D + 1), the residual as last column."""
+        """The weighted rows of each piece, compressed: (N, D + 1, D + 1), the residual as last column. Rows of the same
+        motion stand with the first of its pieces."""
         columns = point.slopes[0].shape[-1] + 1
         found = np.zeros((len(self.pieces), columns, columns))
         for batch, factor, r, slopes in zip(self.batches, factors, point.residuals, point.slopes, strict=True):
@@ -560,6 +656,9 @@ class Residuals:
                 more = np.pad(size * point.across[batch.rows], ((0, 0), (0, 0), (0, columns - self.states)))
                 rows = np.concatenate([rows, more], axis=1)
             found[batch.rows] = compress_rows(rows)
+        for row in np.flatnonzero(self.leads != np.arange(len(self.pieces))):
+            both = found[[self.leads[row], row]].reshape(1, -1, columns)
+            found[self.leads[row]], found[row] = compress_rows(both)[0], 0.0
         return found
 
     # ---- what rounding makes of samples ----
@@ -595,7 +694,7 @@ class Residuals:
     @property
     def free_states(self) -> int:
         """The numbers of all starts that are fitted."""
-        return sum(part.states * int(part.fitted.sum()) for part in self.parts)
+        return sum(part.states * int(self.own_starts[part.frame.rows].sum()) for part in self.parts)
 
     def columns(self, record: int) -> slice:
         part = self._owner(record)

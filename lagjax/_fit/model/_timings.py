@@ -16,8 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._fit.model._parameters import Parameters
-from lagjax._fit.model._records import Guess, MeasuredSignal, real_numbers, require_start
+from lagjax._fit.model._records import Guess, MeasuredSignal, Record, real_numbers, require_start
 from lagjax._interface import Layout, halves
 from lagjax._primitives import sentence
 from lagjax._run import crossings, sections_of, simulate
@@ -45,7 +44,8 @@ class Timings(MeasuredSignal):
     - `times`: when it was crossed, (K,), or a dict of such arrays by the names of the sections. NaN where missing.
     - `t0`: the time at which the motion begins, before all `times`. Crossings are counted from there.
     - `start`: the state at `t0`: (q0, qdot0) if it is known, `lagjax.Guess(q0, qdot0)` to fit it, or a function of the
-      parameters that returns (q0, qdot0).
+      parameters that returns (q0, qdot0). Or a `Record` of the same motion, which begins at `t0`, and is given to `fit`
+      as well: both then have one start, and what belongs to each record.
     - `numbers`: which crossing after `t0` each time is, from 0 on, in the form of `times`; by default 0, 1, 2, ….
       Choose a `t0` that is not near a crossing: one that begins before `t0` shifts the numbers of all.
     - `direction`: −1 only where the section falls, +1 only where it rises, 0 both; or a dict.
@@ -64,7 +64,7 @@ class Timings(MeasuredSignal):
     section: Callable | Transition | str | dict[str, Callable] | dict[str, Transition] | dict[str, str]
     times: Any
     t0: float
-    start: tuple[PyTree, PyTree] | Guess | Callable
+    start: tuple[PyTree, PyTree] | Guess | Callable | Record
     numbers: Any = None
     direction: int | dict[str, int] = 0
     weights: Any = None
@@ -76,8 +76,18 @@ class Timings(MeasuredSignal):
         if isinstance(functions[0], Transition | str) and self.direction != 0:
             raise ValueError("direction is for functions: a transition, or a contact, has its own. Leave it at 0.")
         if self.start is None:
-            raise TypeError("A lagjax.Timings needs a start: (q0, qdot0), lagjax.Guess(q0, qdot0), or a function.")
-        require_start(self.start)
+            raise TypeError(
+                "A lagjax.Timings needs a start: (q0, qdot0), lagjax.Guess(q0, qdot0), a function, or the Record of "
+                "the same motion."
+            )
+        if isinstance(self.start, Record):
+            if self.start.ts[0] != self.t0:
+                raise ValueError(
+                    f"The record of the same motion begins at {self.start.ts[0]:g}, and not at t0 = {self.t0:g}: "
+                    "give that as t0."
+                )
+        else:
+            require_start(self.start)
         if not (np.ndim(self.t0) == 0 and np.isfinite(self.t0)):
             raise ValueError(f"t0 must be a finite number; got {self.t0!r}.")
         times = _section_arrays(self.times, keys, "times")
@@ -204,14 +214,17 @@ class Clock:
         return jax.jit(follow)
 
 
-def build_clock(scene: Scene, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> Clock:
-    """The clock of a scene. Raises `ValueError` for functions of a hybrid one, and for what is of another scene."""
+def build_clock(
+    scene: Scene, layout: Layout, restore: Callable, params: PyTree, timings: Timings, rtol: float
+) -> Clock:
+    """The clock of a scene; `restore` makes its parameters of their numbers, `params` are an example. Raises
+    `ValueError` for functions of a hybrid one, and for what is of another scene."""
     find = _choose_finder(scene, _sections(timings.section)[1][0])
     flat, span = timings.flat, np.array([float(timings.t0), _last_time(timings)])
-    instants, happens, advice = find(scene, layout, parameters, timings, rtol)
+    instants, happens, advice = find(scene, layout, params, timings, rtol)
 
     def given(y0, numbers):
-        return *map(layout.restore, halves(y0)), span, parameters.restore(numbers)
+        return *map(layout.restore, halves(y0)), span, restore(numbers)
 
     def times(y0, numbers):
         mine, t = instants(*given(y0, numbers))
@@ -255,7 +268,7 @@ def _choose_finder(scene: Scene, first: Callable | Transition | str) -> Callable
     return _impacts_in if isinstance(first, str) else _crossings_in
 
 
-def _transitions_in(scene: Hybrid, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> tuple:
+def _transitions_in(scene: Hybrid, layout: Layout, params: PyTree, timings: Timings, rtol: float) -> tuple:
     flat, (_, transitions) = timings.flat, _sections(timings.section)
     ways = np.array([_mode_places(scene, one) for one in transitions])[flat.which]
     if scene.max_transitions < len(flat.times):
@@ -272,10 +285,10 @@ def _transitions_in(scene: Hybrid, layout: Layout, parameters: Parameters, timin
     return instants, lambda m: f"transitions from {' to '.join(repr([*scene.modes][k]) for k in ways[m])}", ""
 
 
-def _impacts_in(system: System, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> tuple:
+def _impacts_in(system: System, layout: Layout, params: PyTree, timings: Timings, rtol: float) -> tuple:
     """A contact is struck where it gives an impulse. Raises `ValueError` for a name that no contact has."""
     flat, (_, struck) = timings.flat, _sections(timings.section)
-    names = system.contact_names(layout, parameters.restore(parameters.example))
+    names = system.contact_names(layout, params)
     short = list(map(_shorten, names))
     for name in struck:
         if name not in (*short, *names):
@@ -293,7 +306,7 @@ def _impacts_in(system: System, layout: Layout, parameters: Parameters, timings:
     return instants, lambda m: f"impacts of {struck[flat.which[m]]!r}", ""
 
 
-def _crossings_in(system: System, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> tuple:
+def _crossings_in(system: System, layout: Layout, params: PyTree, timings: Timings, rtol: float) -> tuple:
     flat, (keys, _) = timings.flat, _sections(timings.section)
     limits = {"direction": timings.direction, "count": int(flat.numbers.max()) + 1, "rtol": rtol, "throw": False}
     if not system.touches:
@@ -306,7 +319,7 @@ def _crossings_in(system: System, layout: Layout, parameters: Parameters, timing
 
     advice = ""
     if system.touches:
-        name = _shorten(system.contact_names(layout, parameters.restore(parameters.example))[0])
+        name = _shorten(system.contact_names(layout, params)[0])
         advice = f" An impact that closes a gap is no crossing: Timings({name!r}, times, …) are those of a contact."
     return instants, lambda m: "crossings" + ("" if keys is None else f" of section[{keys[flat.which[m]]!r}]"), advice
 

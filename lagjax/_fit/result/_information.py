@@ -108,7 +108,7 @@ def information(descent: Descent) -> Information:
     rows = np.concatenate([parameter_rows(triangles, states, unknowns) / unit, np.diag(prior / unit)])
     half = basis @ np.linalg.solve(basis.T @ (rows.T @ rows) @ basis, basis.T)
     weighted = [factor[..., None] * slopes for factor, slopes in zip(factors, trial.slopes, strict=True)]
-    rows_of = [eliminate_starts(triangles[b.rows], own, states) / unit_of[b.rows]
+    rows_of = [eliminate_starts(triangles[residuals.leads[b.rows]], own, states) / unit_of[b.rows]
                for b, own in zip(residuals.batches, weighted, strict=True)]  # fmt: skip
     laws = autocorrelations(residuals, trial, noise, _fitted_products(residuals, triangles, weighted, rows_of, half))
     effective, correlation = (np.array(x) for x in zip(*((a.count / a.time, a.neighbour) for a in laws), strict=True))
@@ -154,7 +154,7 @@ def _fitted_products(residuals: Residuals, triangles, weighted: list, rows_of: l
         values, vectors = np.linalg.eigh(np.pad(half, (0, 1))[columns[:, :, None], columns[:, None]])
         found = [own @ (vectors * np.sqrt(np.maximum(values, 0.0))[:, None])[:, None]]
         if states:
-            decided = decide(triangles[batch.rows, :states, :states], _UNFELT)
+            decided = decide(triangles[residuals.leads[batch.rows], :states, :states], _UNFELT)
             kept = np.arange(states) < decided.rank[:, None]
             inverse = np.where(kept, 1.0 / np.where(kept, decided.values, 1.0), 0.0)
             found.append(raw[..., :states] @ (decided.right * inverse[:, None])[:, None])

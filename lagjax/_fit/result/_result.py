@@ -286,7 +286,7 @@ def _record_residuals(residuals: Residuals, trial: Trial) -> list[np.ndarray]:
     found = [np.full((len(record), own.stop - own.start), np.nan) for record, own in pairs]
     for batch, own in zip(residuals.batches, trial.residuals, strict=True):
         for row, left, weights, values in zip(batch.rows.tolist(), own, batch.weights, batch.values, strict=True):
-            record, places = residuals.pieces[row]
+            record, places, _ = residuals.pieces[row]
             inside = np.where(weights > 0, left + values, np.nan)[: len(places), columns[record]]
             found[record][places] = inside - residuals.records[record].matrix[places]
     return found

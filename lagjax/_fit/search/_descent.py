@@ -128,7 +128,7 @@ class _Model:
         pairs = zip(residuals.batches, at.residuals, near.residuals, at.slopes, strict=True)
         for batch, before, after, slopes in pairs:
             local = np.append(step.u, 0.0)[residuals.unknowns.columns[batch.rows]]
-            along = np.concatenate([starts[batch.rows], local], axis=1)
+            along = np.concatenate([starts[residuals.leads[batch.rows]], local], axis=1)
             curved.append(((after - before) / _NEARBY - np.einsum("ntsd,nd->nts", slopes, along)) / _NEARBY)
         triangles, unknowns = self._linearise(at._replace(residuals=curved))
         of_starts, of_u = scale = column_norms(triangles, residuals.states, unknowns)

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._fit.model._noise import Gaussian, NoiseScale
-from lagjax._fit.model._pieces import Piece
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals
 from lagjax._fit.search._descent import Descent, minimise
 from lagjax._show import even_places
@@ -80,7 +79,8 @@ def run_multistart(
         return search(point), None
     rng = np.random.default_rng(seed)
     u = np.stack([point.u, *(residuals.parameters.draw(point.u, rng) for _ in range(starts - 1))])
-    pieces = [Piece(k, places[even_places(len(places), _SHORT_SAMPLES)]) for k, places in residuals.pieces]
+    samples = [piece.places[even_places(len(piece.places), _SHORT_SAMPLES)] for piece in residuals.pieces]
+    pieces = [piece._replace(places=some) for piece, some in zip(residuals.pieces, samples, strict=True)]
     short = residuals.with_pieces(pieces, residuals.fitted)
     short.watch = None
     trials = []

@@ -8,7 +8,7 @@ from lagjax._fit.model._assembly import errors_of_system
 from lagjax._fit.model._inputs import constant_tables, split_leaves
 from lagjax._fit.model._motions import AbstractMotions
 from lagjax._fit.model._records import Record, known_start, restore_structure
-from lagjax._fit.model._residuals import Residuals, SystemResiduals
+from lagjax._fit.model._residuals import Point, Residuals, SystemResiduals
 from lagjax._fit.model._sensors import UNCLEAR, unwrap_record
 from lagjax._show import even_places
 
@@ -17,6 +17,8 @@ _WINDOWS = (7, 13, 25, 49, 97, 193)  # samples in one of them
 _PROBES = 32  # places of a record where its time scale is looked at
 _WORSE_WINDOW = 1.3  # what a window may leave, in units of what the shortest leaves
 _WINDOWS_IN_ALL = 256  # places of all records where curvature is looked at
+_ROUNDED = 1e-9  # of the largest number of a start: within it one that is given touches
+_SURELY = 5.0  # standard deviations of a state that was read
 _QUARTER = 0.25  # of a period: motion over a segment may be wrong by it; beyond a half residuals have false minima
 
 
@@ -41,6 +43,20 @@ class Reader(NamedTuple):
         read = self.read(places)
         return np.stack([one[k] for k in (0, 1) for one in read], axis=-1)
 
+    @property
+    def noise(self) -> np.ndarray:
+        """How far states may be off, (2n,): those of cubics within their windows."""
+        scatter, windows, step = np.array(self.scatter), np.array(self.windows), np.median(np.diff(self.record.ts))
+        return _SURELY * np.concatenate([scatter, scatter * np.sqrt(75.0 / windows**3) / step])
+
+    def smoothest(self, first: int, last: int) -> int:
+        """The sample from `first` to `last` about which the cubics leave least: away from where the motion jumps."""
+        places = np.arange(first, last + 1)
+        scatter = np.maximum(self.scatter, np.finfo(float).tiny)
+        return first + int(
+            np.argmin(np.max([one[2] / s for one, s in zip(self.read(places), scatter, strict=True)], 0))
+        )
+
     def read(self, places) -> list[tuple]:
         """The result of `_read_states` for every signal at the samples `places`."""
         ts, pairs = self.record.ts[places], zip(_signals(self.record), self.windows, strict=True)
@@ -55,23 +71,27 @@ def _read_states(ts: np.ndarray, t: np.ndarray, y: np.ndarray, window: int):
     """The values of a signal (t, y) and its rates at the times `ts`, what is left, and the local cubics there."""
     if len(t) <= _DEGREE + 1:  # hardly anything was measured: taken to be at rest
         level = np.full(len(ts), np.mean(y) if len(y) else 0.0)
-        return level, np.zeros(len(ts)), 0.0, level[:, None]
+        return level, np.zeros(len(ts)), np.zeros(len(ts)), level[:, None]
     return _local_cubics(ts, t, y, min(window, len(t)))
 
 
 def _window(ts: np.ndarray, t: np.ndarray, y: np.ndarray) -> tuple[int, float]:
     """The number of samples in the window for one signal, and the scatter about the shortest."""
-    scatter = _read_states(ts, t, y, _WINDOWS[0])[2]
+
+    def left(window: int) -> float:
+        return float(np.sqrt(np.mean(_read_states(ts, t, y, window)[2] ** 2)))
+
+    scatter = left(_WINDOWS[0])
     best, most = _WINDOWS[0], _WORSE_WINDOW * scatter
     for window in _WINDOWS[1:]:
-        if window > len(t) or _read_states(ts, t, y, window)[2] > most:
+        if window > len(t) or left(window) > most:
             break
         best = window
     return best, scatter
 
 
 def _local_cubics(ts, t, y, window: int):
-    """Cubics through `window` samples of (t, y) about each of `ts`: values, rates, residual, coefficients (M, 4)."""
+    """Cubics through `window` samples of (t, y) about each of `ts`: values, rates, residuals, coefficients (M, 4)."""
     after = np.searchsorted(t, ts)
     first = np.clip(after - window // 2, 0, len(t) - window)
     places = first[:, None] + np.arange(window)
@@ -85,7 +105,7 @@ def _local_cubics(ts, t, y, window: int):
     coefficients = coefficients[..., 0]
     dof = max(window - powers.shape[-1], 1)
     cubics = coefficients / length ** np.arange(powers.shape[-1])
-    return cubics[:, 0], cubics[:, 1], float(np.sqrt(np.mean(left**2) * window / dof)), cubics
+    return cubics[:, 0], cubics[:, 1], np.sqrt(np.mean(left**2, axis=1) * window / dof), cubics
 
 
 def short_windows(readers: dict[int, Reader], length: float) -> tuple[list[Record], np.ndarray, list[int]]:
@@ -161,10 +181,12 @@ def first_starts(residuals: Residuals, readers: list[Reader | None], params0: An
     """The first guess of the starts of all records, (N, 2n) of the system with the most coordinates."""
     found = []
     for part in residuals.parts:
-        for place, (record, reader) in enumerate(zip(part.records, readers[part.frame.records], strict=True)):
+        first = part.frame.records.start
+        for place, motion in enumerate(residuals.motions[part.frame.records].tolist()):
+            record, reader = residuals.records[motion], readers[motion]
             with errors_of_system(part.name):
                 state = known_start(record, part.layout, place, params0)
-                state = read_start(reader, record, part, f"records[{place}]") if state is None else state
+                state = read_start(reader, record, part, f"records[{motion - first}]") if state is None else state
                 found.append(pad_states(state, residuals.states))
     return np.stack(found)
 
@@ -179,6 +201,16 @@ def read_start(reader: Reader | None, record: Any, part: SystemResiduals, called
         f"{called} needs a start, because its values do not have the structure of q: give start=(q0, qdot0) if it is "
         "known, else start=lagjax.Guess(q0, qdot0)."
     )
+
+
+def start_noise(residuals: Residuals, readers: list[Reader | None], point: Point) -> np.ndarray:
+    """The noise of the starts (N, 2n) of the pieces; what a record says of them is exact, to rounding."""
+    noise = _ROUNDED * np.max(np.abs(point.starts), axis=1, keepdims=True) + np.zeros_like(point.starts)
+    for row, (own, places, _) in enumerate(residuals.pieces):
+        record = residuals.motions[own]
+        if (reader := readers[record]) is not None and (places[0] > 0 or residuals.records[record].begins is None):
+            noise[row] = pad_states(reader.noise, residuals.states)
+    return noise
 
 
 def pad_states(state: np.ndarray, states: int) -> np.ndarray:

@@ -21,16 +21,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lagjax._equations import has_constraints
 from lagjax._fit.model._noise import AbstractNoise
 from lagjax._fit.model._pieces import Piece
-from lagjax._fit.model._records import Record
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals, SystemResiduals
 from lagjax._fit.search._adam import descend_gradient
 from lagjax._fit.search._descent import Anchor, Descent, minimise
 from lagjax._fit.search._multistart import misfit
-from lagjax._fit.search._reader import Reader, pad_states, short_windows, time_scales
+from lagjax._fit.search._reader import Reader, pad_states, short_windows, start_noise, time_scales
 from lagjax._fit.search._unexplained import measure_unexplained
-from lagjax._run.hybrid import jumps
+from lagjax._run.hybrid import Hybrid, jumps, laws
 from lagjax._show import even_places
 
 # In units of half the sum of squares: the end of a search, where parameters are within 0.05 standard deviations of
@@ -47,6 +47,9 @@ _LYAPUNOV = 5.0  # times 1/λ that a record is long: shorter ones are followed w
 # records from which on it pays.
 _SAMPLED, _SAMPLES_EACH, _PAYS = 64, 30, 4
 _SUSPECT, _SAMPLES_OF_LEVEL = 0.05, 4  # of the signals, left by a search; samples for each unknown in first samples
+# Shortest segments of a record, whose motion jumps, from which on they come before other starts. Of up to 17 other
+# starts cost less; of 51 to 115 these did not find the motion in a minute and more, and segments did in 13 to 27 CPU s.
+_LONG = 32
 _GRADIENT_STEPS = 3000  # of a descent by gradients
 
 
@@ -63,26 +66,54 @@ class Search:
         self.residuals, self.law, self.method = residuals, law, method
         rough |= bool(residuals.parameters.prior_weights.any())
         self.enough = _ENOUGH_OF_LEVEL * residuals.measured if rough else _ENOUGH
-        hybrid = [jumps(part.scene) for part in residuals.parts for _ in part.records]
-        if method == "segments" and all(hybrid):
-            raise ValueError('method="segments" cannot cut hybrid motion, whose mode is known at the start: leave it.')
-        self.readers = [None if is_hybrid else reader for is_hybrid, reader in zip(hybrid, readers, strict=True)]
+        whole = [
+            isinstance(part.scene, Hybrid) and any(map(has_constraints, laws(part.scene))) for part in residuals.parts
+        ]
+        self.readers = list(readers)
+        self.jumping = np.array([jumps(part.scene) for part in residuals.parts for _ in part.records])
+        for part, is_whole in zip(residuals.parts, whole, strict=True):
+            if is_whole:  # the constraints of a mode that is not the first
+                self.readers[part.frame.records] = [None] * len(part.records)
 
     def __call__(self, point: Point) -> Descent:
+        """The end of a search from a point. Where the motion jumps whole records come first, which cost less where they
+        can be followed from there; and segments, of records long enough, where that leaves motion."""
+        if self.method != "auto" or not self.jumping.all():
+            return self._search(point)
+        first, lost = None, LostMotion()
+        try:
+            first = self._minimise_whole(point)
+        except LostMotion as reason:
+            lost = reason
+        if first is None or measure_unexplained(first).doubted:
+            cuts = self._cut_records(point.u) if any(self.readers) else []
+            if cuts and len(cuts[0]) >= _LONG * len(self.residuals.records):
+                with contextlib.suppress(LostMotion):
+                    done = self._search(point)
+                    both = [one for one in (first, done) if one is not None and one.residuals is done.residuals]
+                    return max(both, key=lambda one: one.residuals.log_likelihood(one.trial, one.noise))
+        if first is None:
+            raise lost
+        return first
+
+    def _search(self, point: Point) -> Descent:
         if self.method == "segments" and not any(self.readers):
-            raise ValueError('method="segments" reads starts off data: for that values must have the structure of q.')
+            raise ValueError(
+                'method="segments" reads starts off data: for that values must have the structure of q, and no mode of '
+                "a Hybrid may have constraints."
+            )
         levels_done: list[Descent] = []
         if self.method != "whole" and any(self.readers):
             point, levels_done = self._fit_growing_segments(point)
-        good = _last_followed_level(levels_done)
-        if len(levels_done) - good > _LOST:
+        good, all_cut = _last_followed_level(levels_done), all(self.readers)
+        if len(levels_done) - good > _LOST and all_cut:
             return self._search_pieces(levels_done[good], levels_done[-1])
         done, lost = None, LostMotion()
         try:
             done = self._minimise_whole(point)
         except LostMotion as reason:
             lost = reason
-        if levels_done and (done is None or not done.converged or measure_unexplained(done).motion):
+        if levels_done and all_cut and (done is None or not done.converged or measure_unexplained(done).motion):
             good = _last_followed_level([*levels_done, *([] if done is None else [done])])
             if good < len(levels_done) and misfit(levels_done[good].noise, levels_done[good].residuals) < _COARSE:
                 return self._search_pieces(levels_done[good], done)
@@ -114,7 +145,7 @@ class Search:
     def _minimise_sample(self, point: Point, places: np.ndarray, length: int | None) -> Point:
         """The point with what the search of the pieces at `places`, up to a number of samples of each, comes to."""
         residuals = self.residuals
-        pieces = [Piece(k, samples[:length]) for k, samples in (residuals.pieces[place] for place in places)]
+        pieces = [piece._replace(places=piece.places[:length]) for piece in map(residuals.pieces.__getitem__, places)]
         part = residuals.with_pieces(pieces, residuals.fitted[places])
         begin, enough = Point(point.u, point.starts[places]), _ENOUGH_OF_LEVEL * part.measured
         end = minimise(part, begin, self.law, enough, _TRIALS_OF_LEVEL if length else _TRIALS).trial
@@ -206,6 +237,8 @@ class Search:
                 best |= {(k, place): y for place, y in zip(new, read, strict=True)}
         fitted = np.array([self.residuals.fitted[k] or place > 0 for k, place in firsts])
         part, point = self.residuals.with_pieces(pieces, fitted), Point(u, np.stack([best[first] for first in firsts]))
+        if self.jumping.any():
+            part = part.choose_modes(point, start_noise(part, self.readers, point))
         done = minimise(part, point, self.law, _ENOUGH_OF_LEVEL * part.measured, _TRIALS_OF_LEVEL, anchor)
         best |= dict(zip(firsts, done.trial.starts, strict=True))
         return done
@@ -214,7 +247,7 @@ class Search:
         """The u that suits the accelerations of local cubics: these have one minimum where segments are too long."""
         short, states, owners = [], [], []
         for part, scale in zip(self.residuals.parts, self._time_scales(u), strict=True):
-            if np.isfinite(scale):
+            if np.isfinite(scale) and not jumps(part.scene):
                 records, begun, of = short_windows(self._readers_of(part), 0.25 * scale)
                 states.append(pad_states(begun, self.residuals.states))
                 short.append(part.with_records(records, np.ones(len(records), bool)))
@@ -244,7 +277,8 @@ class Search:
     def _cut_records(self, u) -> list[list[Piece]]:
         pairs = zip(self.residuals.parts, self._time_scales(u), strict=True)
         scales = [scale for part, scale in pairs for _ in part.records]
-        return _levels([None if reader is None else reader.record for reader in self.readers], scales)
+        modes = [piece.mode for piece in self.residuals.pieces]
+        return _levels(self.readers, scales, self.jumping, modes)
 
     # ---- gradients ----
 
@@ -325,13 +359,14 @@ def _separation(done: Descent) -> float:
 
 # ---- cuts of records into segments -----------------------------------------------------------------------------------
 
-_FEWEST_IN_SEGMENT = 8  # samples
+_FEWEST_IN_SEGMENT, _ASIDE = 8, 3  # samples; the part of a segment by which an edge may move
 
 
-def _levels(records: list[Record | None], scales: list[float]) -> list[list[Piece]]:
+def _levels(readers: list[Reader | None], scales: list[float], jumping: np.ndarray, modes: list) -> list[list[Piece]]:
     """Cuts of records from segments of two of their time `scales` to whole records, each twice as long as the one
-    before; none where records are hardly longer, and None instead of a record leaves it out."""
-    edges = [(k, record, _edges(record, 2.0 * scales[k])) for k, record in enumerate(records) if record is not None]
+    before; none where records are hardly longer, and None instead of a reader leaves its record out."""
+    reading = [(k, reader) for k, reader in enumerate(readers) if reader is not None]
+    edges = [(k, reader.record, _edges(reader, 2.0 * scales[k], jumping[k])) for k, reader in reading]
     most, found, stride = max(len(e) - 1 for *_, e in edges), [], 1
     while stride < most:
         pieces = []
@@ -339,15 +374,20 @@ def _levels(records: list[Record | None], scales: list[float]) -> list[list[Piec
             cut = [*e[:-1:stride].tolist(), len(record)]
             if len(cut) > 2 and 2 * (e[-1] - cut[-2]) < e[min(stride, len(e) - 1)] - e[0]:
                 del cut[-2]  # a rest shorter than half a segment joins the one before
-            pieces += [Piece(k, np.arange(a, b)) for a, b in itertools.pairwise(cut)]
+            pieces += [Piece(k, np.arange(a, b), () if a else modes[k]) for a, b in itertools.pairwise(cut)]
         found.append(pieces)
         stride *= 2
     return found
 
 
-def _edges(record: Record, length: float) -> np.ndarray:
-    """The first samples of the shortest segments of one record, and its length."""
-    ts = record.ts
+def _edges(reader: Reader, length: float, jumping: bool) -> np.ndarray:
+    """The first samples of the shortest segments of one record, and its length; where the motion jumps, those near by
+    that look smooth."""
+    ts = reader.record.ts
     count = max(1, int((ts[-1] - ts[0]) / length)) if np.isfinite(length) else 1
     count = max(1, min(count, len(ts) // _FEWEST_IN_SEGMENT))
-    return np.unique(np.append(np.searchsorted(ts, np.linspace(ts[0], ts[-1], count + 1)[:-1]), len(ts)))
+    found = np.searchsorted(ts, np.linspace(ts[0], ts[-1], count + 1)[:-1])
+    if jumping and count > 1:
+        aside = int(np.diff(found).min()) // _ASIDE
+        found[1:] = [reader.smoothest(place - aside, min(place + aside, len(ts) - 1)) for place in found[1:]]
+    return np.unique(np.append(found, len(ts)))

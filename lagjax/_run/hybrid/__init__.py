@@ -273,6 +273,11 @@ def jumps(scene: Any) -> bool:
     return isinstance(scene, Hybrid) or scene.touches
 
 
+def begin_in(scene: Scene, mode: Any) -> Scene:
+    """The scene, a hybrid one so that it begins in the mode of this number, which may be traced."""
+    return dataclasses.replace(scene, start=mode) if isinstance(scene, Hybrid) else scene
+
+
 def first_law(scene: Scene) -> System:
     """The `System`, or that of the mode in which a `Hybrid` begins: of any mode, if that is traced."""
     if not isinstance(scene, Hybrid):
