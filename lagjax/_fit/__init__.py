@@ -34,7 +34,7 @@ from lagjax._fit.model._sensors import Delayed, wrapped
 from lagjax._fit.model._timings import Timings
 from lagjax._fit.model._transforms import Smooth, Unbounded, angle, between, inertia, positive, simplex
 from lagjax._fit.result._comparison import Comparison
-from lagjax._fit.result._evidence import begin_weakly, find_smoothness
+from lagjax._fit.result._evidence import begin_weakly, describe_sizes, find_smoothness
 from lagjax._fit.result._experiments import Experiments
 from lagjax._fit.result._mistakes import SECONDS, find_mistake, possible_mistakes
 from lagjax._fit.result._prediction import Prediction
@@ -178,7 +178,8 @@ def fit(
     try:
         done, left = search.fit(given, looks_further=True)
     except LostMotion as reason:
-        text = f"{reason} Begin nearer: other params0, or starts that are known."
+        sizes = describe_sizes(parameters)
+        text = " ".join([f"{reason} Begin nearer: other params0, or starts that are known.", *sizes])
         nothing = Unexplained([text], [], np.inf, True, list(range(len(given[0].records))))
         more = search.find_mistake(given, nothing, time.process_time() - begun)
         raise ValueError(" ".join([text, *more])) from None

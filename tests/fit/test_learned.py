@@ -137,6 +137,26 @@ def test_a_rougher_function_has_a_weaker_prior():
     assert found[0] < found[1] - 0.5
 
 
+@pytest.mark.parametrize(("size", "begin"), [(1e9, 1e9), (1e9, 1.0)])
+def test_friction_that_begins_far_from_its_size_is_found(size, begin):
+    """Nine orders too small, too; of a straight line in the logarithm evidence makes the prior as strong as it can be,
+    and all that is free is seen beside it."""
+    law = dissipation((0.0, 2.5), count=6, dry=False)
+    scene = lagjax.System(
+        lambda q, v, params: size * (0.5 * v**2 - 0.5 * params["k"] * q**2),
+        forces=lambda q, v, params: law(v, params=params["R"]),
+    )
+    true = {"k": 4.0, "R": law.interpolate(lambda v: 0.1 * size)}
+    ts, rng = np.linspace(0.0, 10.0, 101), np.random.default_rng(0)
+    record = lagjax.Record(ts, lagjax.simulate(scene, 1.0, 0.0, ts, true).q + 1e-3 * rng.normal(size=ts.size))
+    fit = lagjax.fit(scene, record, {"k": 3.0, "R": law.interpolate(lambda v: begin)})
+    assert fit.ok and not fit.unseen, fit
+    low, high = fit.intervals(0.999)
+    assert low["k"] < 4.0 < high["k"]
+    assert (low["R"]["spline"] < np.log(0.1 * size)).all() and (np.log(0.1 * size) < high["R"]["spline"]).all()
+    np.testing.assert_allclose(law(1.0, params=fit.params["R"]), -0.1 * size, rtol=0.02)
+
+
 @pytest.mark.parametrize("mass", [1e-9, pytest.param(1e24, marks=pytest.mark.slow)])
 def test_other_units_change_no_digit(mass):
     """A potential in other units of energy, with a mass in other units, has the same motion and the same evidence."""

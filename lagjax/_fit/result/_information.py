@@ -104,7 +104,7 @@ def information(descent: Descent) -> Information:
         null, basis = np.eye(free), np.zeros((free, 0))
     laws = autocorrelations(residuals, trial, noise)
     effective, correlation = (np.array(x) for x in zip(*((a.count / a.time, a.neighbour) for a in laws), strict=True))
-    unit = _lengths(triangles, states, unknowns)  # of columns: their squares may be no numbers
+    unit = _lengths(triangles, states, unknowns, prior)  # of columns: their squares may be no numbers
     unit_of = np.append(unit, 1.0)[unknowns.columns][:, None, None]
     share = effective.sum() / max(sum(law.count for law in laws), 1)  # a prior is worth more beside correlated samples
     middle, rows_of = np.diag((prior / unit) ** 2 / share), []
@@ -157,7 +157,7 @@ def null_space(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Directions of u (F, K) that nothing depends on, the starts being free, and on which no prior of weights (F,) has
     an opinion; and a basis (F, F − K) of the others."""
-    rows, unit = parameter_rows(triangles, states, unknowns), _lengths(triangles, states, unknowns)
+    rows, unit = parameter_rows(triangles, states, unknowns), _lengths(triangles, states, unknowns, prior)
     rows = np.concatenate([rows, np.diag(prior)])
     if not len(unit):
         return np.zeros((0, 0)), np.zeros((0, 0))
@@ -200,9 +200,9 @@ def parameter_rows(triangles: np.ndarray, states: int, unknowns: Unknowns) -> np
     return compress_rows(own.reshape(1, own.shape[0] * own.shape[1], own.shape[-1]))[0]
 
 
-def _lengths(triangles: np.ndarray, states: int, unknowns: Unknowns) -> np.ndarray:
-    """The length of the column of each unknown (F,), one for a column of nothing."""
-    length = unknowns.norms(_norm(triangles[..., states:-1], 1))
+def _lengths(triangles: np.ndarray, states: int, unknowns: Unknowns, prior: np.ndarray) -> np.ndarray:
+    """The length of the column of each unknown (F,), with the row of its prior; one for a column of nothing."""
+    length = np.hypot(unknowns.norms(_norm(triangles[..., states:-1], 1)), prior)
     return np.where(length > _NOTHING, length, 1.0)
 
 

@@ -28,6 +28,7 @@ from lagjax._fit.model._records import Record
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals, Trial, compress_rows
 from lagjax._fit.model._sensor_faults import TOO_COARSE, constant_signals, describe_sensors
 from lagjax._fit.model._transforms import Between, Positive
+from lagjax._fit.result._evidence import describe_sizes
 from lagjax._fit.result._information import Information, eliminate_starts, information
 from lagjax._fit.search._descent import Descent, column_norms, eliminate
 from lagjax._fit.search._unexplained import MOST_NAMED, Unexplained, measure_unexplained, unexplained_motion
@@ -60,7 +61,7 @@ def verdict(
     elif astray:
         text = f"Take starts={more}, or begin nearer; else the scene lacks something."
         parts.append(f"Motion is left, and of motion that sticks, or strikes, another search may end better. {text}")
-    parts += left.motion + left.noise
+    parts += [*left.motion, *(describe_sizes(residuals.parameters) if left.motion else []), *left.noise]
     triangles = residuals.linearise(descent.trial, descent.noise)
     at_ends, named = _describe_ends(residuals, descent.trial, triangles, known)
     parts += at_ends
