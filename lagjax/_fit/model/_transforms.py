@@ -430,7 +430,7 @@ class Smooth(AbstractTransform):
     So a prior density exp(−λ |D x|²/2), with λ the `strength`, is one of independent u. `basis` (n, m) is B, `back`
     (m, n) its inverse, `rough` (m,) is 1 or 0 for each of the u; `knots` (n,) are the places of the numbers, None of
     several arguments. One direction changes x by `largest` in one step of the search: those of a potential, in which
-    motion is nearly linear, by anything, logarithms of friction and inertia as those of a positive number, and u_0, which
+    motion is nearly linear, by anything, logarithms of friction and inertia as those of a positive number; u_0, which
     then raises all x alike, moves as the logarithm of one.
     """
 

@@ -17,6 +17,7 @@ rows are multiplied by, so they are looked for a second time where every row has
 there is not seen, and what is not was drowned. Where rows grow by more than there are digits, all are.
 """
 
+import contextlib
 from typing import NamedTuple
 
 import numpy as np
@@ -43,6 +44,7 @@ _GROWTH = 1e-2 / NULL
 # motion of many, and no derivative of it says how well anything is known.
 _LOST = 1.0 / np.finfo(float).eps
 
+_FAR = 0.1  # of the least singular value, told by a bound of it: an inverse of F columns is right to so much
 # The length of a column below which it is zero: one over it must have a square, and some room, among finite numbers.
 _NOTHING = 1e-140
 _UNFELT = 1e-10  # of the largest singular value of a start: a direction of it that nothing depends on
@@ -132,8 +134,8 @@ def information(descent: Descent) -> Information:
     lost = max(effective.sum() / max(effective.sum() - used, 1.0), 1.0)
     robust = np.mean([1.0 if np.isinf(d) else (d + 3) / (d + 1) for d in noise.dof])
     rows, basis = parameter_rows(triangles, states, unknowns) / unit, basis * unit[:, None]
-    rows = np.concatenate([rows, np.diag(prior / unit)])
-    half = basis @ np.linalg.solve(basis.T @ (rows.T @ rows) @ basis, basis.T)
+    square = rows.T @ rows + np.diag((prior / unit) ** 2)
+    half = basis @ np.linalg.solve(basis.T @ square @ basis, basis.T) if null.size else np.linalg.inv(square)
     white = robust * half / unit / unit[:, None]
     covariance = lost * robust * half @ middle @ half.T / unit / unit[:, None]
     unseen = np.linalg.norm(null, axis=1) > 1e-6 if null.size else np.zeros(free, bool)
@@ -158,13 +160,22 @@ def null_space(
     """Directions of u (F, K) that nothing depends on, the starts being free, and on which no prior of weights (F,) has
     an opinion; and a basis (F, F − K) of the others."""
     rows, unit = parameter_rows(triangles, states, unknowns), _lengths(triangles, states, unknowns, prior)
-    rows = np.concatenate([rows, np.diag(prior)])
-    if not len(unit):
-        return np.zeros((0, 0)), np.zeros((0, 0))
+    if prior.any():
+        rows = np.concatenate([rows, np.diag(prior)])
+    if not len(unit) or _is_regular(rows / unit):
+        return np.zeros((len(unit), 0)), np.diag(1.0 / unit)
     # From above zero by its own round-off, so that a column which is noise alone counts as nothing.
     decided = decide(rows / unit, NULL, NULL)
     null = decided.null / unit[:, None]
     return null / _norm(null, 0), decided.right[:, : int(decided.rank)] / unit[:, None]
+
+
+def _is_regular(rows: np.ndarray) -> bool:
+    """True if a square matrix (F, F) has no singular value near those that count as null, told by its inverse."""
+    if rows.shape[0] == rows.shape[1]:
+        with contextlib.suppress(np.linalg.LinAlgError):
+            return _FAR / np.linalg.norm(np.linalg.inv(rows)) > NULL * max(1.0, np.linalg.norm(rows))
+    return False
 
 
 def confirmed_null(residuals: Residuals, point: Trial, null: np.ndarray) -> np.ndarray:
@@ -195,9 +206,15 @@ def growth(sizes: list[np.ndarray]) -> float:
 
 
 def parameter_rows(triangles: np.ndarray, states: int, unknowns: Unknowns) -> np.ndarray:
-    """The rows of the unknowns, orthogonal to those of the starts: a triangle with F columns."""
-    own = unknowns.spread(eliminate_starts(triangles, triangles[..., :-1], states))
-    return compress_rows(own.reshape(1, own.shape[0] * own.shape[1], own.shape[-1]))[0]
+    """The rows of the unknowns, orthogonal to those of the starts: F of F columns where all records have as many
+    numbers of their own, which are eliminated one record after the other."""
+    rows, own = unknowns.stack_by_owner(eliminate_starts(triangles, triangles[..., :-1], states)), unknowns.own
+    r = compress_rows(rows) if own else rows
+    rest, first = r[:, own:, own:], unknowns.of_owners
+    rest = compress_rows(rest.reshape(1, rest.shape[0] * rest.shape[1], rest.shape[2]))
+    last = first.select([0]).spread(np.pad(rest, ((0, 0), (0, 0), (own, 0))))[0]
+    alone = first.spread(r[:, :own])
+    return np.concatenate([alone.reshape(len(alone) * own, unknowns.count), last])
 
 
 def _lengths(triangles: np.ndarray, states: int, unknowns: Unknowns, prior: np.ndarray) -> np.ndarray:
