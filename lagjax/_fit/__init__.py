@@ -48,6 +48,7 @@ from lagjax._fit.search._multistart import Waterfall, run_multistart
 from lagjax._fit.search._reader import TimeScales, first_starts, read_records, time_scales
 from lagjax._fit.search._search import Search, search_again
 from lagjax._fit.search._unexplained import Unexplained
+from lagjax._interface import labelled_leaves
 from lagjax._primitives import with_doubles
 from lagjax._run.hybrid import Scene, jumps
 from lagjax._scene import HOLDS
@@ -189,7 +190,17 @@ def fit(
         laws = find_laws(params0)
         search = search._replace(build=lambda records: keep_selected(build(records), selection, laws))
     more = search.find_mistake(given, left, time.process_time() - begun)
-    return replace(done, ok=done.ok and not more, message=" ".join([done.message, *more]))
+    whole = [] if done.ok or free is not None else _describe_whole_numbers(params0)
+    return replace(done, ok=done.ok and not more, message=" ".join([done.message, *whole, *more]))
+
+
+def _describe_whole_numbers(params0: PyTree) -> list[str]:
+    """A sentence about the numbers that stay because they are integers, if there are any."""
+    labels, leaves, _ = labelled_leaves(params0, "params")
+    whole = [label for label, leaf in zip(labels, leaves, strict=True) if np.asarray(leaf).dtype.kind in "iu"]
+    if not whole:
+        return []
+    return [f"Whole numbers are not fitted, but stay: {', '.join(whole)}. Write 3.0 instead of 3 for one that is free."]
 
 
 class _FitSearch(NamedTuple):

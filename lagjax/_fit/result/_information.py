@@ -117,9 +117,9 @@ def information(descent: Descent) -> Information:
         for s in np.flatnonzero(np.isnan(residuals.sensor.step)):
             middle += columns.add(correlated_square(close_gaps(own[:, :, s], batch.weights[..., s] > 0), laws[s].lags))
     for s in np.flatnonzero(np.isfinite(residuals.sensor.step)).tolist():
-        sigma, step = noise.sigma[s], residuals.sensor.step[s]
+        sigma, step = noise.sigma[s] / residuals.unit[s], residuals.sensor.step[s]
         _, rest, before = harmonics(step, sigma)
-        rows = [np.sqrt(b.weights[..., s, None]) / sigma * own[:, :, s]
+        rows = [np.sqrt(b.weights[..., s, None]) / noise.sigma[s] * own[:, :, s]
                 for b, own in zip(residuals.batches, rows_of, strict=True)]  # fmt: skip
         for g, b in zip(rows, residuals.batches, strict=True):
             g, columns = close_gaps(g, b.weights[..., s] > 0), unknowns.select(b.rows)

@@ -74,7 +74,8 @@ def verdict(
     bent = _describe_bends(descent, known)
     parts += apart + pulls + bent
     for part in residuals.parts:
-        records, own = [r for r in part.records if isinstance(r, Record)], part.sensor_noise(descent.noise)
+        scatter = descent.noise._replace(sigma=descent.noise.sigma / residuals.unit)
+        records, own = [r for r in part.records if isinstance(r, Record)], part.sensor_noise(scatter)
         if records:
             parts += describe_sensors(records, law, part.signals.names, part.sensor, own.sigma)
     parts += [] if left.motion else _describe_missed_limits(residuals, descent.trial)

@@ -190,7 +190,7 @@ class Search:
             if reading := self._readers_of(part):
                 scatter = np.sqrt(np.mean([np.square(reader.scatter) for reader in reading.values()], axis=0))
                 near.append(np.maximum(_POOR * scatter, _COARSE * part.size[: len(scatter)]))
-        ratio = done.noise.sigma / np.concatenate(near)
+        ratio = done.noise.sigma / (done.residuals.unit * np.concatenate(near))
         return _ShortestSegments(done.trial.u, cuts, best, float(np.mean(np.log(ratio))), done)
 
     def _fit_level(self, pieces: list[Piece], u, best: dict, anchor: Anchor) -> Descent:
