@@ -9,7 +9,7 @@ import scipy.interpolate
 import lagjax
 from lagjax.learned import dissipation, inertia, potential
 
-WELL = potential((-1.5, 1.5), count=16)
+WELL = potential((-1.5, 1.5), count=24)
 well = lagjax.System(lambda q, v, params: 0.5 * v**2 - WELL(q, params=params))
 FRICTION = dissipation((0.0, 2.0), count=10)
 block = lagjax.System(
@@ -63,7 +63,7 @@ def test_machine_code_follows_a_spline():
     by_start, by_params = slopes(1.2, params)
     h = 1e-5
     np.testing.assert_allclose(by_start, (run(1.2 + h, params)[-1] - run(1.2 - h, params)[-1]) / (2 * h), rtol=1e-5)
-    direction = np.random.default_rng(0).normal(size=16)
+    direction = np.random.default_rng(0).normal(size=24)
     ends = [run(1.2, params | {"spline": params["spline"] + s * direction})[-1] for s in (-h, h)]
     np.testing.assert_allclose(by_params["spline"] @ direction, (ends[1] - ends[0]) / (2 * h), rtol=1e-5)
 
@@ -135,6 +135,16 @@ def test_a_rougher_function_has_a_weaker_prior():
         message = lagjax.fit(well, records, WELL.params0).message
         found.append(float(message.split("Data determine ")[1].split()[0]))
     assert found[0] < found[1] - 0.5
+
+
+def test_too_few_knots_are_not_ok():
+    """The well of Duffing is no spline of eight knots: intervals would be ten times too narrow beside its ends."""
+    duffing = lagjax.System(lambda q, v, params: 0.5 * v**2 - double_well(q))
+    [record] = record_motion(duffing, [(1.45, 0.1)], {})
+    law = potential((-1.5, 1.5), count=8)
+    scene = lagjax.System(lambda q, v, params: 0.5 * v**2 - law(q, params=params))
+    fit = lagjax.fit(scene, record, law.params0)
+    assert not fit.ok and "Take a larger count" in fit.message
 
 
 @pytest.mark.parametrize(("size", "begin"), [(1e9, 1e9), (1e9, 1.0)])

@@ -33,6 +33,7 @@ _ENOUGH_OF_ROUND = 1e-3  # of those before for each sample: a strength that will
 _ROUNDS = 20  # of fits, most of which take two trials
 _SAME = 0.1  # |log λ| between two fits: intervals differ by a hundredth
 _STRAIGHT_LINE = 0.01  # numbers of the shape that data determine: with fewer λ is any that is large enough
+_KNOTS_FULL = 0.96  # of the numbers that knots allow: with more, finer knots show more, and intervals are wrong without
 _INNER, _INNER_SAME = 200, 1e-3  # rounds in the linear model
 # λ over what data say of an unknown: a function that data determine at every knot, and one that is a straight line.
 _WEAKEST, _STRONGEST = 1e-15, 1e12
@@ -85,10 +86,23 @@ def find_smoothness(done: Descent, law: AbstractNoise, tell: Callable[[str], Non
     done = minimise(done.residuals, done.trial.point, law, _ENOUGH, _TRIALS)
     square = _data_square(done.residuals, done.trial, done.noise)
     covariance = _covariance(square, done.residuals.parameters.prior_weights**2)
+    parts = smooth_parts(done.residuals.parameters)
     said = [text, *describe_sizes(done.residuals.parameters)] if text else []
-    said += [_sentence(covariance, part) for part in smooth_parts(done.residuals.parameters)]
-    message = " ".join([done.message, *said])
-    return done._replace(converged=done.converged and not text, trials=trials + done.trials, message=message)
+    full = [_describe_full(part) for part in parts if _is_full(covariance, part)]
+    message = " ".join([done.message, *said, *(_sentence(covariance, part) for part in parts), *full])
+    converged = done.converged and not (text or full)
+    return done._replace(converged=converged, trials=trials + done.trials, message=message)
+
+
+def _is_full(covariance: np.ndarray, part: SmoothPart) -> bool:
+    return _count_numbers(covariance, part, part.transform.strength) > _KNOTS_FULL * len(part.rough)
+
+
+def _describe_full(part: SmoothPart) -> str:
+    return (
+        f"That is all that the knots of {part.label} allow: the function may be finer, and its intervals leave that "
+        "out. Take a larger count, half as many again."
+    )
 
 
 def smooth_parts(parameters: Parameters) -> list[SmoothPart]:
