@@ -147,7 +147,19 @@ def test_too_few_knots_are_not_ok():
     assert not fit.ok and "Take a larger count" in fit.message
 
 
-@pytest.mark.parametrize(("size", "begin"), [(1e9, 1e9), (1e9, 1.0)])
+@pytest.mark.parametrize(("ends", "ok", "words"), [
+    ((5.0, 9.0), False, "no motion was measured between the ends of its range"),
+    ((-3.0, 3.0), True, "a straight line, where motion saw it, from -1.67 to 1.67;"),
+])  # fmt: skip
+def test_a_straight_line_is_said_to_be_one_and_a_range_without_motion_is_not_ok(ends, ok, words):
+    law = potential(ends, count=10)
+    scene = lagjax.System(lambda q, v, params: 0.5 * v**2 - 2.0 * q**2 - law(q, params=params))
+    [record] = record_motion(lagjax.System(lambda q, v: 0.5 * v**2 - 2.0 * q**2), [(1.0, 0.0)], {})
+    fit = lagjax.fit(scene, record, law.params0)
+    assert fit.ok == ok and words in fit.message, fit.message
+
+
+@pytest.mark.parametrize(("size", "begin"), [pytest.param(1e-3, 1e-3, marks=pytest.mark.slow), (1e9, 1.0)])
 def test_friction_that_begins_far_from_its_size_is_found(size, begin):
     """Nine orders too small, too; of a straight line in the logarithm evidence makes the prior as strong as it can be,
     and all that is free is seen beside it."""

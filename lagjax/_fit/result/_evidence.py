@@ -38,6 +38,7 @@ _INNER, _INNER_SAME = 200, 1e-3  # rounds in the linear model
 # λ over what data say of an unknown: a function that data determine at every knot, and one that is a straight line.
 _WEAKEST, _STRONGEST = 1e-15, 1e12
 _FIRST = 1e-9  # of what data say: less than they do but where they say nothing
+_FELT = 1e-4  # of the most that data say about a number at a knot: below, motion does not come near it
 _SEEN = 0.5  # of the prior variance of a second difference: where the posterior variance is less, data were seen
 
 
@@ -89,8 +90,8 @@ def find_smoothness(done: Descent, law: AbstractNoise, tell: Callable[[str], Non
     parts = smooth_parts(done.residuals.parameters)
     said = [text, *describe_sizes(done.residuals.parameters)] if text else []
     full = [_describe_full(part) for part in parts if _is_full(covariance, part)]
-    message = " ".join([done.message, *said, *(_sentence(covariance, part) for part in parts), *full])
-    converged = done.converged and not (text or full)
+    message = " ".join([done.message, *said, *(_sentence(square, covariance, part) for part in parts), *full])
+    converged = done.converged and not (text or full or any(_is_passed(square, part) for part in parts))
     return done._replace(converged=converged, trials=trials + done.trials, message=message)
 
 
@@ -182,7 +183,7 @@ def _data_square(residuals: Residuals, trial: Trial, noise: NoiseScale) -> np.nd
     return rows.T @ rows
 
 
-def _sentence(covariance: np.ndarray, part: SmoothPart) -> str:
+def _sentence(square: np.ndarray, covariance: np.ndarray, part: SmoothPart) -> str:
     """A sentence: how many numbers of a learned function the data determine, and between which places they show it."""
     determined = _count_numbers(covariance, part, part.transform.strength)
     text = f"Data determine {determined:.1f} numbers of the shape of {part.label}"
@@ -190,7 +191,30 @@ def _sentence(covariance: np.ndarray, part: SmoothPart) -> str:
     before = np.sum((bends * part.transform.rough) ** 2, axis=1) / part.transform.strength
     after = np.einsum("kf,fg,kg->k", bends, covariance[part.own, part.own], bends)
     seen = 1 + np.flatnonzero(after < _SEEN * before)
-    if not seen.size or (knots := part.transform.knots) is None:
+    if (knots := part.transform.knots) is None:
         return f"{text}."
-    where = f"seen from {knots[seen[0]]:.3g} to {knots[seen[-1]]:.3g}"
-    return f"{text}, which was {where}; beyond, its interval is its prior's."
+    if seen.size:
+        where = f"seen from {knots[seen[0]]:.3g} to {knots[seen[-1]]:.3g}"
+        return f"{text}, which was {where}; beyond, its interval is its prior's."
+    if _is_passed(square, part):
+        return (
+            f"{text}: no motion was measured between the ends of its range, only its slope beyond one of them is seen."
+        )
+    felt = _find_felt(square, part)
+    if not felt.size:
+        return f"{text}."
+    where = f"from {knots[felt[0]]:.3g} to {knots[felt[-1]]:.3g}"
+    return f"{text}: a straight line, where motion saw it, {where}; beyond, its interval takes it for one as well."
+
+
+def _find_felt(square: np.ndarray, part: SmoothPart) -> np.ndarray:
+    """The knots whose numbers the motion depends on by more than a trace."""
+    back = part.transform.back
+    each = np.einsum("fk,fg,gk->k", back, square[part.own, part.own], back)
+    return np.flatnonzero(each > _FELT * each.max(initial=0.0))
+
+
+def _is_passed(square: np.ndarray, part: SmoothPart) -> bool:
+    """True if motion passes a learned function by: of its straight line beyond an end two numbers tell all."""
+    felt = _find_felt(square, part)
+    return part.transform.knots is not None and len(felt) == 2 and (felt.max() <= 1 or felt.min() >= len(part.rough))
