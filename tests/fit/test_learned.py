@@ -22,6 +22,21 @@ def double_well(q):
     return 0.25 * q**4 - 0.5 * q**2
 
 
+duffing = lagjax.System(lambda q, v: 0.5 * v**2 - double_well(q))
+spring = lagjax.System(lambda q, v: 0.5 * v**2 - 2.0 * q**2)
+
+
+def oscillator_with(law, k=0.0):
+    return lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * k * q**2 - law(q, params=params))
+
+
+def damped_spring(law, size):
+    return lagjax.System(
+        lambda q, v, params: size * (0.5 * v**2 - 0.5 * params["k"] * q**2),
+        forces=lambda q, v, params: law(v, params=params["R"]),
+    )
+
+
 def test_a_spline_is_the_natural_one_of_scipy():
     """Its second derivative is zero at the ends, and it is a straight line beyond them."""
     params, [knots] = WELL.interpolate(double_well), WELL.knots
@@ -139,11 +154,9 @@ def test_a_rougher_function_has_a_weaker_prior():
 
 def test_too_few_knots_are_not_ok():
     """The well of Duffing is no spline of eight knots: intervals would be ten times too narrow beside its ends."""
-    duffing = lagjax.System(lambda q, v, params: 0.5 * v**2 - double_well(q))
     [record] = record_motion(duffing, [(1.45, 0.1)], {})
     law = potential((-1.5, 1.5), count=8)
-    scene = lagjax.System(lambda q, v, params: 0.5 * v**2 - law(q, params=params))
-    fit = lagjax.fit(scene, record, law.params0)
+    fit = lagjax.fit(oscillator_with(law), record, law.params0)
     assert not fit.ok and "Take a larger count" in fit.message
 
 
@@ -153,9 +166,8 @@ def test_too_few_knots_are_not_ok():
 ])  # fmt: skip
 def test_a_straight_line_is_said_to_be_one_and_a_range_without_motion_is_not_ok(ends, ok, words):
     law = potential(ends, count=10)
-    scene = lagjax.System(lambda q, v, params: 0.5 * v**2 - 2.0 * q**2 - law(q, params=params))
-    [record] = record_motion(lagjax.System(lambda q, v: 0.5 * v**2 - 2.0 * q**2), [(1.0, 0.0)], {})
-    fit = lagjax.fit(scene, record, law.params0)
+    [record] = record_motion(spring, [(1.0, 0.0)], {})
+    fit = lagjax.fit(oscillator_with(law, 4.0), record, law.params0)
     assert fit.ok == ok and words in fit.message, fit.message
 
 
@@ -164,10 +176,7 @@ def test_friction_that_begins_far_from_its_size_is_found(size, begin):
     """Nine orders too small, too; of a straight line in the logarithm evidence makes the prior as strong as it can be,
     and all that is free is seen beside it."""
     law = dissipation((0.0, 2.5), count=6, dry=False)
-    scene = lagjax.System(
-        lambda q, v, params: size * (0.5 * v**2 - 0.5 * params["k"] * q**2),
-        forces=lambda q, v, params: law(v, params=params["R"]),
-    )
+    scene = damped_spring(law, size)
     true = {"k": 4.0, "R": law.interpolate(lambda v: 0.1 * size)}
     ts, rng = np.linspace(0.0, 10.0, 101), np.random.default_rng(0)
     record = lagjax.Record(ts, lagjax.simulate(scene, 1.0, 0.0, ts, true).q + 1e-3 * rng.normal(size=ts.size))

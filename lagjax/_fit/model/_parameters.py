@@ -447,7 +447,7 @@ class Unknowns(NamedTuple):
         return stack_rows(rows, np.unique(self.owners, return_inverse=True)[1])
 
     @property
-    def of_owners(self) -> "Unknowns":
+    def owner_rows(self) -> "Unknowns":
         """Those of one record of each owner, in the order of `stack_by_owner`."""
         return self.select(np.unique(self.owners, return_index=True)[1])
 

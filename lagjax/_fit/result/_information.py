@@ -210,7 +210,7 @@ def parameter_rows(triangles: np.ndarray, states: int, unknowns: Unknowns) -> np
     numbers of their own, which are eliminated one record after the other."""
     rows, own = unknowns.stack_by_owner(eliminate_starts(triangles, triangles[..., :-1], states)), unknowns.own
     r = compress_rows(rows) if own else rows
-    rest, first = r[:, own:, own:], unknowns.of_owners
+    rest, first = r[:, own:, own:], unknowns.owner_rows
     rest = compress_rows(rest.reshape(1, rest.shape[0] * rest.shape[1], rest.shape[2]))
     last = first.select([0]).spread(np.pad(rest, ((0, 0), (0, 0), (own, 0))))[0]
     alone = first.spread(r[:, :own])

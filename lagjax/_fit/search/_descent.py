@@ -260,7 +260,7 @@ def _limited_step(rows: np.ndarray, of_u: np.ndarray, damping: float, pull, unkn
 def _damped_step(rows: np.ndarray, damping: np.ndarray, pull, unknowns: Unknowns) -> np.ndarray:
     """δu (F,) that minimises |rows (δu, 1)|² + |pull|² + |damping δu|²: the numbers of records, each behind its rows
     (O, M, L + 1), are eliminated from those that all share."""
-    own, shared, alone = unknowns.own, unknowns.shared, unknowns.of_owners.columns[:, : unknowns.own]
+    own, shared, alone = unknowns.own, unknowns.shared, unknowns.owner_rows.columns[:, : unknowns.own]
 
     def regular_rows(places: np.ndarray) -> np.ndarray:
         """The rows of damping and pull of the unknowns at `places` (..., K), and their residuals: (..., 2 K, K + 1)."""
