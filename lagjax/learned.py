@@ -226,7 +226,7 @@ def potential(range: Any, count: Any = 20, periodic: Any = False) -> FreeFunctio
     - `range`: (low, high) of its argument, wherever the motion is expected; ((a, b), (c, d)) for two arguments, or
       three. Beyond it V is a straight line, continuous with its first two derivatives.
     - `count`: knots of every argument, 4 or more: enough for the finest shape that you expect. More cost little, since
-      the smoothness is found by evidence.
+      the smoothness is found by evidence; where the data determine a number at every knot, the fit asks for more.
     - `periodic`: whether the range is a period, of an angle for instance; of several arguments each.
 
     **Gives** a `FreeFunction`, called as `V(q, params=…)`; `V.params0` is where a fit begins.

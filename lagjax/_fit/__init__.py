@@ -35,7 +35,7 @@ from lagjax._fit.model._sensors import Delayed, wrapped
 from lagjax._fit.model._timings import Timings
 from lagjax._fit.model._transforms import Smooth, Unbounded, angle, between, inertia, positive, simplex
 from lagjax._fit.result._comparison import Comparison
-from lagjax._fit.result._evidence import begin_weakly, find_smoothness
+from lagjax._fit.result._evidence import begin_weakly, describe_sizes, find_smoothness
 from lagjax._fit.result._experiments import Experiments
 from lagjax._fit.result._mistakes import SECONDS, find_mistake, possible_mistakes
 from lagjax._fit.result._prediction import Prediction
@@ -49,6 +49,7 @@ from lagjax._fit.search._multistart import Waterfall, run_multistart
 from lagjax._fit.search._reader import TimeScales, first_starts, read_records, start_noise, time_scales
 from lagjax._fit.search._search import Search, search_again
 from lagjax._fit.search._unexplained import Unexplained, measure_unexplained
+from lagjax._interface import labelled_leaves
 from lagjax._primitives import with_doubles
 from lagjax._run.hybrid import Scene, jumps
 from lagjax._scene import HOLDS
@@ -181,7 +182,8 @@ def fit(
     try:
         done, left = search.fit(given, looks_further=True)
     except LostMotion as reason:
-        text = f"{reason} Begin nearer: other params0, or starts that are known."
+        sizes = describe_sizes(parameters)
+        text = " ".join([f"{reason} Begin nearer: other params0, or starts that are known.", *sizes])
         nothing = Unexplained([text], [], np.inf, True, list(range(len(given[0].records))))
         more = search.find_mistake(given, nothing, time.process_time() - begun)
         raise ValueError(" ".join([text, *more])) from None
@@ -191,7 +193,17 @@ def fit(
         laws = find_laws(params0)
         search = search._replace(build=lambda records: keep_selected(build(records), selection, laws))
     more = search.find_mistake(given, left, time.process_time() - begun)
-    return replace(done, ok=done.ok and not more, message=" ".join([done.message, *more]))
+    whole = [] if done.ok or free is not None else _describe_whole_numbers(params0)
+    return replace(done, ok=done.ok and not more, message=" ".join([done.message, *whole, *more]))
+
+
+def _describe_whole_numbers(params0: PyTree) -> list[str]:
+    """A sentence about the numbers that stay because they are integers, if there are any."""
+    labels, leaves, _ = labelled_leaves(params0, "params")
+    whole = [label for label, leaf in zip(labels, leaves, strict=True) if np.asarray(leaf).dtype.kind in "iu"]
+    if not whole:
+        return []
+    return [f"Whole numbers are not fitted, but stay: {', '.join(whole)}. Write 3.0 instead of 3 for one that is free."]
 
 
 class _FitSearch(NamedTuple):

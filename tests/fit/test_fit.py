@@ -710,3 +710,18 @@ def test_a_fit_of_very_many_numbers_names_the_method_that_is_meant_for_it():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         lagjax.fit(MANY_WEIGHTS, record, {"w": np.full(101, 0.1)}, method="whole")
+
+
+DAMPED_SPRING = lagjax.System(
+    lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2, forces=lambda q, v, params: -params["c"] * v
+)
+
+
+@pytest.mark.parametrize("begin", [1e-9, 1e-15])
+def test_two_positive_numbers_that_begin_many_orders_too_small_are_found(begin):
+    """Neither moves anything there, and of both together the first segments say by how much they are to grow."""
+    ts, true = np.linspace(0.0, 10.0, 201), {"k": 4.0, "c": 0.1}
+    values = lagjax.simulate(DAMPED_SPRING, 1.0, 0.0, ts, true).q + 1e-3 * np.random.default_rng(0).normal(size=ts.size)
+    fit = lagjax.fit(DAMPED_SPRING, lagjax.Record(ts, values), {"k": begin, "c": begin}, transforms=lagjax.positive)
+    low, high = fit.intervals(0.999)
+    assert fit.ok and all(low[name] < true[name] < high[name] for name in true)

@@ -9,6 +9,7 @@ import lagjax
 from lagjax import per_record
 from lagjax._fit.model._parameters import Unknowns
 from lagjax._fit.model._residuals import compress_rows
+from lagjax._fit.result._information import eliminate_starts, parameter_rows
 from lagjax._fit.search import _descent
 
 TS = np.linspace(0.0, 6.0, 151)
@@ -317,3 +318,15 @@ def test_mistakes_are_sentences():
         lagjax.fit(SCENE, RECORDS, PARAMS0, observe=shifted, free={**FREE, "offset": 3})
     with pytest.raises(ValueError, match=r"params\['offset'\] must start above zero"):
         lagjax.fit(SCENE, RECORDS, PARAMS0, observe=shifted, free=FREE, transforms=lagjax.positive)
+
+
+def test_numbers_of_records_are_eliminated_one_record_after_the_other():
+    """The square of the rows is that of the whole matrix, where records share owners and have more or fewer numbers."""
+    rng, columns = np.random.default_rng(0), np.array([[0, 1, 5, 6], [0, 1, 5, 6], [2, 7, 5, 6], [3, 4, 5, 6]])
+    unknowns = Unknowns(columns, np.array([0, 0, 1, 2]), 2, 7)
+    triangles = np.triu(rng.normal(size=(4, 7, 7)))
+    triangles[2, :, 3] = 0.0  # of a number that it does not have
+    whole = unknowns.spread(eliminate_starts(triangles, triangles[..., :-1], 2)).reshape(-1, 7)
+    rows = parameter_rows(triangles, 2, unknowns)
+    assert len(rows) == 3 * 2 + 2
+    np.testing.assert_allclose(rows.T @ rows, whole.T @ whole, atol=1e-12)

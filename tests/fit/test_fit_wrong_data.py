@@ -8,7 +8,7 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from lagrangians import damping
+from lagrangians import damping, spring
 
 import lagjax
 from lagjax._fit.model._autocorrelation import correlated_power, first_lag_products
@@ -234,3 +234,28 @@ def test_a_long_chaotic_record_is_followed_in_pieces():
     assert found.residuals[0].shape == (6001, 2) and len(found.starts) == 1
     assert max(found.rms.values()) == pytest.approx(SIGMA, rel=0.05)
     np.testing.assert_allclose(found.starts[0][0], [2.0, 2.5], atol=3 * SIGMA)
+
+
+SPRING = lagjax.System(spring)
+PULLED = lagjax.System(lambda q, v, params: spring(q, v, params) - params["f"] * q)
+
+
+@pytest.mark.parametrize("step", [None, 0.02])
+def test_the_size_of_all_weights_changes_nothing(step):
+    """Only their ratios count: in metres or kilometres, with weights 1/σ² or 1; also where a sensor rounds."""
+    ts, rng = np.linspace(0.0, 10.0, 201), np.random.default_rng(0)
+    values = np.cos(2.0 * ts) + 1e-3 * rng.normal(size=ts.size)
+    values = values if step is None else step * np.round(values / step)
+    each = 1.0 if step else rng.uniform(0.5, 2.0, ts.size)
+    fits = [lagjax.fit(SPRING, lagjax.Record(ts, values, weights=w * each), {"k": 3.0}) for w in (1.0, 1e-24, 1e24)]
+    for fit in fits:
+        assert fit.ok and fit.message == fits[0].message
+        np.testing.assert_allclose(fit.params["k"], 4.0, atol=4e-3)
+        for end, other in zip(fit.intervals(), fits[0].intervals(), strict=True):
+            np.testing.assert_allclose(end["k"], other["k"], rtol=1e-9)
+
+
+def test_a_whole_number_that_stays_is_named():
+    ts = np.linspace(0.0, 10.0, 201)
+    fit = lagjax.fit(PULLED, lagjax.Record(ts, np.cos(2.0 * ts)), {"k": 1, "f": 0.1})
+    assert not fit.ok and "params['k']. Write 3.0 instead of 3" in fit.message

@@ -9,7 +9,7 @@ import scipy.interpolate
 import lagjax
 from lagjax.learned import dissipation, inertia, potential
 
-WELL = potential((-1.5, 1.5), count=16)
+WELL = potential((-1.5, 1.5), count=24)
 well = lagjax.System(lambda q, v, params: 0.5 * v**2 - WELL(q, params=params))
 FRICTION = dissipation((0.0, 2.0), count=10)
 block = lagjax.System(
@@ -20,6 +20,21 @@ STILL = lagjax.Record([0.0, 1.0], [0.0, 0.0])
 
 def double_well(q):
     return 0.25 * q**4 - 0.5 * q**2
+
+
+duffing = lagjax.System(lambda q, v: 0.5 * v**2 - double_well(q))
+spring = lagjax.System(lambda q, v: 0.5 * v**2 - 2.0 * q**2)
+
+
+def oscillator_with(law, k=0.0):
+    return lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * k * q**2 - law(q, params=params))
+
+
+def damped_spring(law, size):
+    return lagjax.System(
+        lambda q, v, params: size * (0.5 * v**2 - 0.5 * params["k"] * q**2),
+        forces=lambda q, v, params: law(v, params=params["R"]),
+    )
 
 
 def test_a_spline_is_the_natural_one_of_scipy():
@@ -63,7 +78,7 @@ def test_machine_code_follows_a_spline():
     by_start, by_params = slopes(1.2, params)
     h = 1e-5
     np.testing.assert_allclose(by_start, (run(1.2 + h, params)[-1] - run(1.2 - h, params)[-1]) / (2 * h), rtol=1e-5)
-    direction = np.random.default_rng(0).normal(size=16)
+    direction = np.random.default_rng(0).normal(size=24)
     ends = [run(1.2, params | {"spline": params["spline"] + s * direction})[-1] for s in (-h, h)]
     np.testing.assert_allclose(by_params["spline"] @ direction, (ends[1] - ends[0]) / (2 * h), rtol=1e-5)
 
@@ -135,6 +150,42 @@ def test_a_rougher_function_has_a_weaker_prior():
         message = lagjax.fit(well, records, WELL.params0).message
         found.append(float(message.split("Data determine ")[1].split()[0]))
     assert found[0] < found[1] - 0.5
+
+
+def test_too_few_knots_are_not_ok():
+    """The well of Duffing is no spline of eight knots: intervals would be ten times too narrow beside its ends."""
+    [record] = record_motion(duffing, [(1.45, 0.1)], {})
+    law = potential((-1.5, 1.5), count=8)
+    fit = lagjax.fit(oscillator_with(law), record, law.params0)
+    assert not fit.ok and "Take a larger count" in fit.message
+
+
+@pytest.mark.parametrize(("ends", "ok", "words"), [
+    ((5.0, 9.0), False, "no motion was measured between the ends of its range"),
+    ((-3.0, 3.0), True, "a straight line, where motion saw it, from -1.67 to 1.67;"),
+])  # fmt: skip
+def test_a_straight_line_is_said_to_be_one_and_a_range_without_motion_is_not_ok(ends, ok, words):
+    law = potential(ends, count=10)
+    [record] = record_motion(spring, [(1.0, 0.0)], {})
+    fit = lagjax.fit(oscillator_with(law, 4.0), record, law.params0)
+    assert fit.ok == ok and words in fit.message, fit.message
+
+
+@pytest.mark.parametrize(("size", "begin"), [pytest.param(1e-3, 1e-3, marks=pytest.mark.slow), (1e9, 1.0)])
+def test_friction_that_begins_far_from_its_size_is_found(size, begin):
+    """Nine orders too small, too; of a straight line in the logarithm evidence makes the prior as strong as it can be,
+    and all that is free is seen beside it."""
+    law = dissipation((0.0, 2.5), count=6, dry=False)
+    scene = damped_spring(law, size)
+    true = {"k": 4.0, "R": law.interpolate(lambda v: 0.1 * size)}
+    ts, rng = np.linspace(0.0, 10.0, 101), np.random.default_rng(0)
+    record = lagjax.Record(ts, lagjax.simulate(scene, 1.0, 0.0, ts, true).q + 1e-3 * rng.normal(size=ts.size))
+    fit = lagjax.fit(scene, record, {"k": 3.0, "R": law.interpolate(lambda v: begin)})
+    assert fit.ok and not fit.unseen, fit
+    low, high = fit.intervals(0.999)
+    assert low["k"] < 4.0 < high["k"]
+    assert (low["R"]["spline"] < np.log(0.1 * size)).all() and (np.log(0.1 * size) < high["R"]["spline"]).all()
+    np.testing.assert_allclose(law(1.0, params=fit.params["R"]), -0.1 * size, rtol=0.02)
 
 
 @pytest.mark.parametrize("mass", [1e-9, pytest.param(1e24, marks=pytest.mark.slow)])

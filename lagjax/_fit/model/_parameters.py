@@ -447,9 +447,9 @@ class Unknowns(NamedTuple):
         return stack_rows(rows, np.unique(self.owners, return_inverse=True)[1])
 
     @property
-    def owner_columns(self) -> np.ndarray:
-        """The columns of each owner (O, own), in the order of `stack_by_owner`."""
-        return self.columns[np.unique(self.owners, return_index=True)[1], : self.own]
+    def owner_rows(self) -> "Unknowns":
+        """Those of one record of each owner, in the order of `stack_by_owner`."""
+        return self.select(np.unique(self.owners, return_index=True)[1])
 
 
 def stack_rows(rows: np.ndarray, which: np.ndarray) -> np.ndarray:

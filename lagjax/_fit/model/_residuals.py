@@ -447,7 +447,8 @@ class Residuals:
       pieces.
     - `motions` (R,): of every record the one of the same motion that has the start. `leads` (N,): of every piece that
       which has it, `own_starts` (N,) whether it is its own, and free.
-    - `names`, `size`, `least` (S,): signals, their root mean square, and the smallest noise that can be estimated.
+    - `names`, `size`, `least` (S,): signals, their root mean square, and the smallest noise that can be estimated;
+      `unit` (S,): the root of their mean weight, by which noise is larger than scatter.
     - `batches`: the samples, with a column for every signal; `weights` (M, S): all of theirs; `measured`: how many.
     - `watch` is called with every trial of `evaluate`.
     """
@@ -480,9 +481,11 @@ class Residuals:
         heads = ["" if part.name is None else f"{part.name}: " for part in self.parts]
         self.names = tuple(head + x for head, part in zip(heads, self.parts, strict=True) for x in part.names)
         self.size = np.concatenate([part.size for part in self.parts])
-        self.least = np.concatenate([part.least for part in self.parts])
         self.batches = [b._replace(rows=part.frame.rows[b.rows]) for part in self.parts for b in part.batches]
         self.weights = np.concatenate([b.weights.reshape(-1, len(self.names)) for b in self.batches])
+        count = np.maximum((self.weights > 0).sum(axis=0), 1)
+        self.unit = np.sqrt(np.where(self.weights.any(axis=0), self.weights.sum(axis=0) / count, 1.0))
+        self.least = self.unit * np.concatenate([part.least for part in self.parts])
         self.sensor: Sensor = self.parts[0].frame.sensor
         sides = [b.sides.reshape(-1, len(self.names)) for b in self.batches if b.sides is not None]
         self.sides = np.concatenate(sides) if sides else None
@@ -674,7 +677,7 @@ class Residuals:
         for batch, exact in zip(self.batches, self.exact_values(point, signal), strict=True):
             found.append(np.zeros(exact.shape))
             for own, x, there in zip(found[-1], exact, batch.weights[..., signal] > 0, strict=True):
-                own[there] = worths(x[there], self.sensor.step[signal], noise.sigma[signal])
+                own[there] = worths(x[there], self.sensor.step[signal], float((noise.sigma / self.unit)[signal]))
         return found
 
     def count_runs_once(self, point: Trial, noise: NoiseScale) -> "Residuals":

@@ -430,7 +430,8 @@ class Smooth(AbstractTransform):
     So a prior density exp(−λ |D x|²/2), with λ the `strength`, is one of independent u. `basis` (n, m) is B, `back`
     (m, n) its inverse, `rough` (m,) is 1 or 0 for each of the u; `knots` (n,) are the places of the numbers, None of
     several arguments. One direction changes x by `largest` in one step of the search: those of a potential, in which
-    motion is nearly linear, by anything, logarithms of friction and inertia as those of a positive number.
+    motion is nearly linear, by anything, logarithms of friction and inertia as those of a positive number; u_0, which
+    then raises all x alike, moves as the logarithm of one.
     """
 
     reach: ClassVar[float] = np.inf
@@ -448,10 +449,9 @@ class Smooth(AbstractTransform):
         """The map of numbers whose roughness is xᵀ `square` x; with `gauge` a constant is no part of them."""
         sizes, vectors = np.linalg.eigh(square)
         rough = sizes > _STRAIGHT * sizes[-1]
-        straight = vectors[:, ~rough]
-        if gauge:
-            one = np.ones(len(square)) / np.sqrt(len(square))
-            straight = np.linalg.svd(straight - np.outer(one, one @ straight))[0][:, : straight.shape[1] - 1]
+        straight, one = vectors[:, ~rough], np.ones((len(square), 1)) / np.sqrt(len(square))
+        straight = np.linalg.svd(straight - one @ (one.T @ straight))[0][:, : straight.shape[1] - 1]
+        straight = straight if gauge else np.concatenate([one, straight], axis=1)
         scale = np.sqrt(sizes[rough])
         basis = np.concatenate([straight, vectors[:, rough] / scale], axis=1)
         back = np.concatenate([straight.T, scale[:, None] * vectors[:, rough].T])
@@ -463,7 +463,22 @@ class Smooth(AbstractTransform):
 
     def limits(self, u):
         ends = self.largest / np.abs(self.basis).max(axis=0)
-        return -ends, ends
+        low, high = -ends, ends.copy()
+        if np.isfinite(self.largest):
+            low[0], high[0] = np.expm1([-self.largest, self.largest]) / self.basis[0, 0]
+        return low, high
+
+    def leaps(self, u):
+        low, high = self.limits(u)
+        high[0] = np.inf
+        return low, high
+
+    def take_step(self, u, step):
+        end = u + step
+        if np.isfinite(self.largest):
+            with np.errstate(invalid="ignore", divide="ignore"):
+                end[0] = u[0] + np.log1p(self.basis[0, 0] * step[0]) / self.basis[0, 0]
+        return end
 
     def prior_weights(self, count):
         return np.sqrt(self.strength) * self.rough

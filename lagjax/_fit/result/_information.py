@@ -17,6 +17,7 @@ rows are multiplied by, so they are looked for a second time where every row has
 there is not seen, and what is not was drowned. Where rows grow by more than there are digits, all are.
 """
 
+import contextlib
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +25,7 @@ from scipy.special import stdtrit
 
 from lagjax._equations import decide
 from lagjax._fit.model._autocorrelation import autocorrelations, close_gaps, correlated_square, lag_products
-from lagjax._fit.model._noise import harmonics, rounding_square
+from lagjax._fit.model._noise import NoiseScale, harmonics, rounding_square
 from lagjax._fit.model._parameters import Unknowns
 from lagjax._fit.model._residuals import Residuals, Trial, compress_rows
 from lagjax._fit.search._descent import Descent
@@ -43,6 +44,7 @@ _GROWTH = 1e-2 / NULL
 # motion of many, and no derivative of it says how well anything is known.
 _LOST = 1.0 / np.finfo(float).eps
 
+_FAR = 0.1  # of the least singular value, told by a bound of it: an inverse of F columns is right to so much
 # The length of a column below which it is zero: one over it must have a square, and some room, among finite numbers.
 _NOTHING = 1e-140
 _UNFELT = 1e-10  # of the largest singular value of a start: a direction of it that nothing depends on
@@ -102,35 +104,17 @@ def information(descent: Descent) -> Information:
     free, states = len(trial.u), residuals.states
     if _largest_slope(residuals, trial) > _LOST and growth(row_sizes(residuals, trial)) > _LOST:
         null, basis = np.eye(free), np.zeros((free, 0))
-    unit = _lengths(triangles, states, unknowns)  # of columns: their squares may be no numbers
+    unit = _lengths(triangles, states, unknowns, prior)  # of columns: their squares may be no numbers
     unit_of = np.append(unit, 1.0)[unknowns.columns][:, None, None]
     basis = basis * unit[:, None]
-    rows = np.concatenate([parameter_rows(triangles, states, unknowns) / unit, np.diag(prior / unit)])
-    half = basis @ np.linalg.solve(basis.T @ (rows.T @ rows) @ basis, basis.T)
+    rows = parameter_rows(triangles, states, unknowns) / unit
+    square = rows.T @ rows + np.diag((prior / unit) ** 2)
+    half = basis @ np.linalg.solve(basis.T @ square @ basis, basis.T) if null.size else np.linalg.inv(square)
     weighted = [factor[..., None] * slopes for factor, slopes in zip(factors, trial.slopes, strict=True)]
     rows_of = [eliminate_starts(triangles[residuals.leads[b.rows]], own, states) / unit_of[b.rows]
                for b, own in zip(residuals.batches, weighted, strict=True)]  # fmt: skip
     laws = autocorrelations(residuals, trial, noise, _fitted_products(residuals, triangles, weighted, rows_of, half))
-    effective, correlation = (np.array(x) for x in zip(*((a.count / a.time, a.neighbour) for a in laws), strict=True))
-    share = effective.sum() / max(sum(law.count for law in laws), 1)  # a prior is worth more beside correlated samples
-    middle = np.diag((prior / unit) ** 2 / share)
-    for batch, own in zip(residuals.batches, rows_of, strict=True):
-        columns = unknowns.select(batch.rows)
-        for s in np.flatnonzero(np.isnan(residuals.sensor.step)):
-            middle += columns.add(correlated_square(close_gaps(own[:, :, s], batch.weights[..., s] > 0), laws[s].lags))
-    for s in np.flatnonzero(np.isfinite(residuals.sensor.step)).tolist():
-        sigma, step = noise.sigma[s], residuals.sensor.step[s]
-        _, rest, before = harmonics(step, sigma)
-        rows = [np.sqrt(b.weights[..., s, None]) / sigma * own[:, :, s]
-                for b, own in zip(residuals.batches, rows_of, strict=True)]  # fmt: skip
-        for g, b in zip(rows, residuals.batches, strict=True):
-            g, columns = close_gaps(g, b.weights[..., s] > 0), unknowns.select(b.rows)
-            middle += columns.add(before * correlated_square(g, laws[s].lags) + rest * correlated_square(g, np.ones(1)))
-        rows = [unknowns.select(b.rows).spread(g) for b, g in zip(residuals.batches, rows, strict=True)]
-        middle += rounding_square(rows, residuals.exact_values(trial, s), step, sigma)
-        share = min(before / sigma**2, 1.0)
-        worth = sum(float(w.sum()) for w in residuals.worths(trial, noise, s))
-        effective[s], correlation[s] = worth / (1 + (laws[s].time - 1) * share), share * correlation[s]
+    middle, effective, correlation = _noisy_square(residuals, trial, noise, rows_of, laws, prior / unit)
     # Student's t tells (ν+1)/(ν+3) of what a Gaussian of the same σ tells; the dof that were used up are counted.
     used = free - null.shape[1] + residuals.free_states
     lost = max(effective.sum() / max(effective.sum() - used, 1.0), 1.0)
@@ -143,6 +127,33 @@ def information(descent: Descent) -> Information:
     covariance[unseen, unseen] = np.inf
     confirmed = null if not null.size else confirmed_null(residuals, trial, null)
     return Information(covariance, null, confirmed, effective, correlation, white, float(lost))
+
+
+def _noisy_square(residuals: Residuals, trial: Trial, noise: NoiseScale, rows_of: list, laws: list, prior: np.ndarray):
+    """GᵀC G (F, F) of the rows G of unknowns with the correlations C, with a `prior` (F,); `effective` samples (S,) and
+    the `correlation` (S,) of neighbours."""
+    unknowns = residuals.unknowns
+    effective, correlation = (np.array(x) for x in zip(*((a.count / a.time, a.neighbour) for a in laws), strict=True))
+    share = effective.sum() / max(sum(law.count for law in laws), 1)  # a prior is worth more beside correlated samples
+    middle = np.diag(prior**2 / share)
+    for batch, own in zip(residuals.batches, rows_of, strict=True):
+        columns = unknowns.select(batch.rows)
+        for s in np.flatnonzero(np.isnan(residuals.sensor.step)):
+            middle += columns.add(correlated_square(close_gaps(own[:, :, s], batch.weights[..., s] > 0), laws[s].lags))
+    for s in np.flatnonzero(np.isfinite(residuals.sensor.step)).tolist():
+        sigma, step = noise.sigma[s] / residuals.unit[s], residuals.sensor.step[s]
+        _, rest, before = harmonics(step, sigma)
+        rows = [np.sqrt(b.weights[..., s, None]) / noise.sigma[s] * own[:, :, s]
+                for b, own in zip(residuals.batches, rows_of, strict=True)]  # fmt: skip
+        for g, b in zip(rows, residuals.batches, strict=True):
+            g, columns = close_gaps(g, b.weights[..., s] > 0), unknowns.select(b.rows)
+            middle += columns.add(before * correlated_square(g, laws[s].lags) + rest * correlated_square(g, np.ones(1)))
+        rows = [unknowns.select(b.rows).spread(g) for b, g in zip(residuals.batches, rows, strict=True)]
+        middle += rounding_square(rows, residuals.exact_values(trial, s), step, sigma)
+        share = min(before / sigma**2, 1.0)
+        worth = sum(float(w.sum()) for w in residuals.worths(trial, noise, s))
+        effective[s], correlation[s] = worth / (1 + (laws[s].time - 1) * share), share * correlation[s]
+    return middle, effective, correlation
 
 
 def _fitted_products(residuals: Residuals, triangles, weighted: list, rows_of: list, half: np.ndarray) -> np.ndarray:
@@ -178,14 +189,23 @@ def null_space(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Directions of u (F, K) that nothing depends on, the starts being free, and on which no prior of weights (F,) has
     an opinion; and a basis (F, F − K) of the others."""
-    rows, unit = parameter_rows(triangles, states, unknowns), _lengths(triangles, states, unknowns)
-    rows = np.concatenate([rows, np.diag(np.minimum(prior, unit))])  # else a strong one would hide what data say
-    if not len(unit):
-        return np.zeros((0, 0)), np.zeros((0, 0))
+    rows, unit = parameter_rows(triangles, states, unknowns), _lengths(triangles, states, unknowns, prior)
+    if prior.any():
+        rows = np.concatenate([rows, np.diag(prior)])
+    if not len(unit) or _is_regular(rows / unit):
+        return np.zeros((len(unit), 0)), np.diag(1.0 / unit)
     # From above zero by its own round-off, so that a column which is noise alone counts as nothing.
     decided = decide(rows / unit, NULL, NULL)
     null = decided.null / unit[:, None]
     return null / _norm(null, 0), decided.right[:, : int(decided.rank)] / unit[:, None]
+
+
+def _is_regular(rows: np.ndarray) -> bool:
+    """True if a square matrix (F, F) has no singular value near those that count as null, told by its inverse."""
+    if rows.shape[0] == rows.shape[1]:
+        with contextlib.suppress(np.linalg.LinAlgError):
+            return bool(_FAR / np.linalg.norm(np.linalg.inv(rows)) > NULL * max(1.0, np.linalg.norm(rows)))
+    return False
 
 
 def confirmed_null(residuals: Residuals, point: Trial, null: np.ndarray) -> np.ndarray:
@@ -216,14 +236,20 @@ def growth(sizes: list[np.ndarray]) -> float:
 
 
 def parameter_rows(triangles: np.ndarray, states: int, unknowns: Unknowns) -> np.ndarray:
-    """The rows of the unknowns, orthogonal to those of the starts: a triangle with F columns."""
-    own = unknowns.spread(eliminate_starts(triangles, triangles[..., :-1], states))
-    return compress_rows(own.reshape(1, own.shape[0] * own.shape[1], own.shape[-1]))[0]
+    """The rows of the unknowns, orthogonal to those of the starts: F of F columns where all records have as many
+    numbers of their own, which are eliminated one record after the other."""
+    rows, own = unknowns.stack_by_owner(eliminate_starts(triangles, triangles[..., :-1], states)), unknowns.own
+    r = compress_rows(rows) if own else rows
+    rest, first = r[:, own:, own:], unknowns.owner_rows
+    rest = compress_rows(rest.reshape(1, rest.shape[0] * rest.shape[1], rest.shape[2]))
+    last = first.select([0]).spread(np.pad(rest, ((0, 0), (0, 0), (own, 0))))[0]
+    alone = first.spread(r[:, :own])
+    return np.concatenate([alone.reshape(len(alone) * own, unknowns.count), last])
 
 
-def _lengths(triangles: np.ndarray, states: int, unknowns: Unknowns) -> np.ndarray:
-    """The length of the column of each unknown (F,), one for a column of nothing."""
-    length = unknowns.norms(_norm(triangles[..., states:-1], 1))
+def _lengths(triangles: np.ndarray, states: int, unknowns: Unknowns, prior: np.ndarray) -> np.ndarray:
+    """The length of the column of each unknown (F,), with the row of its prior; one for a column of nothing."""
+    length = np.hypot(unknowns.norms(_norm(triangles[..., states:-1], 1)), prior)
     return np.where(length > _NOTHING, length, 1.0)
 
 

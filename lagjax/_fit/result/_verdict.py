@@ -28,6 +28,7 @@ from lagjax._fit.model._records import Record
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals, Trial, compress_rows
 from lagjax._fit.model._sensor_faults import TOO_COARSE, constant_signals, describe_sensors
 from lagjax._fit.model._transforms import Between, Positive
+from lagjax._fit.result._evidence import describe_sizes
 from lagjax._fit.result._information import Information, eliminate_starts, information
 from lagjax._fit.search._descent import Descent, column_norms, eliminate
 from lagjax._fit.search._unexplained import MOST_NAMED, Unexplained, measure_unexplained, unexplained_motion
@@ -60,7 +61,7 @@ def verdict(
     elif astray:
         text = f"Take starts={more}, or begin nearer; else the scene lacks something."
         parts.append(f"Motion is left, and of motion that sticks, or strikes, another search may end better. {text}")
-    parts += left.motion + left.noise
+    parts += [*left.motion, *(describe_sizes(residuals.parameters) if left.motion else []), *left.noise]
     triangles = residuals.linearise(descent.trial, descent.noise)
     at_ends, named = _describe_ends(residuals, descent.trial, triangles, known)
     parts += at_ends
@@ -73,7 +74,8 @@ def verdict(
     bent = _describe_bends(descent, known)
     parts += apart + pulls + bent
     for part in residuals.parts:
-        records, own = [r for r in part.records if isinstance(r, Record)], part.sensor_noise(descent.noise)
+        scatter = descent.noise._replace(sigma=descent.noise.sigma / residuals.unit)
+        records, own = [r for r in part.records if isinstance(r, Record)], part.sensor_noise(scatter)
         if records:
             parts += describe_sensors(records, law, part.signals.names, part.sensor, own.sigma)
     parts += [] if left.motion else _describe_missed_limits(residuals, descent.trial)

@@ -38,9 +38,9 @@ _NEAR = 1e-3  # per sample: where it pays to look at how much the residuals are 
 _NEARBY, _MOST_BEND = 0.1, 0.375
 _TAKEN_BACK = 8  # trials of a search: of that many in turn the last step is 2⁻³⁶ as long as the first
 _FLAT = 1e-13  # relative: half the sum of squares is itself rounded to so much
-_STOPPED = "The search was stopped after {} trials: half the sum of squares may fall by {:.2g}."
+_STOPPED = "The search was stopped after {}: half the sum of squares may fall by {:.2g}."
 _KINK = (
-    "The search stopped at a kink of the sum of squares after {} trials: derivatives promise to lower half of it by "
+    "The search stopped at a kink of the sum of squares after {}: derivatives promise to lower half of it by "
     "{:.2g}, the last {} trials lowered it by {:.2g}. Motion that sticks, or strikes, has such kinks; friction that "
     "changes sign over a small velocity, tanh(v/width), has none."
 )
@@ -209,21 +209,25 @@ def _descend(
                 trial, trials = farther, trials + 1
                 continue
             if model.is_enough(gain, enough):
-                return end(True, trials, f"The search converged after {trials} trials."), blind
-            return end(False, trials, _STOPPED.format(trials, gain)), blind
+                return end(True, trials, f"The search converged after {_count_trials(trials)}."), blind
+            return end(False, trials, _STOPPED.format(_count_trials(trials), gain)), blind
         recent = sum(fall for place, fall in falls if place > trials - _PATIENCE)
         if trials - falls[0][0] >= _PATIENCE and model.is_enough(recent, enough):
-            return end(False, trials, _KINK.format(trials, gain, _PATIENCE, recent)), blind
+            return end(False, trials, _KINK.format(_count_trials(trials), gain, _PATIENCE, recent)), blind
         better, damping, trials, taken_back = _find_better_trial(model, damping, trials, limit, takes_back)
         takes_back -= len(taken_back)
         blind = taken_back[-1] if taken_back else blind
         if better is None and trials < limit:
-            text = f"The search stopped where rounding hides what is left, after {trials} trials."
+            text = f"The search stopped where rounding hides what is left, after {_count_trials(trials)}."
             return end(True, trials, text), blind
         if better is None:
-            return end(False, trials, _STOPPED.format(trials, gain)), blind
+            return end(False, trials, _STOPPED.format(_count_trials(trials), gain)), blind
         falls.append((trials, model.cost - model.cost_of(better)))
         trial = better
+
+
+def _count_trials(trials: int) -> str:
+    return f"{trials} trial" + "s" * (trials != 1)
 
 
 def _find_better_trial(
@@ -301,7 +305,7 @@ def _limited_step(rows: np.ndarray, of_u: np.ndarray, damping: float, pull, unkn
 def _damped_step(rows: np.ndarray, damping: np.ndarray, pull, unknowns: Unknowns) -> np.ndarray:
     """δu (F,) that minimises |rows (δu, 1)|² + |pull|² + |damping δu|²: the numbers of records, each behind its rows
     (O, M, L + 1), are eliminated from those that all share."""
-    own, shared, alone = unknowns.own, unknowns.shared, unknowns.owner_columns
+    own, shared, alone = unknowns.own, unknowns.shared, unknowns.owner_rows.columns[:, : unknowns.own]
 
     def regular_rows(places: np.ndarray) -> np.ndarray:
         """The rows of damping and pull of the unknowns at `places` (..., K), and their residuals: (..., 2 K, K + 1)."""

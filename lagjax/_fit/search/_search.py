@@ -38,6 +38,7 @@ from lagjax._show import even_places
 _ENOUGH, _ENOUGH_OF_LEVEL = 1e-3, 1e-2
 _ENOUGH_OF_WINDOWS = 0.1
 _POOR, _COARSE = 2.0, 0.02  # times scatter or size of signals: beyond, the shortest segments were not fitted
+_SHORTEST = 1e-12  # of the time of a record: in a shorter window times are rounded to one
 _LOOSE = 3.0  # standard deviations of u about its first value on these levels, where u is a logarithm or the like
 _TRIALS, _TRIALS_OF_LEVEL = 300, 20
 _WORSE = 5.0  # times more that a join may leave: without friction it was 3, beyond the horizon 10 and more
@@ -193,9 +194,10 @@ class Search:
         reach = self.residuals.parameters.reach
         anchor = Anchor(point.u, np.where(np.isfinite(reach), 1.0 / _LOOSE, 0.0))
         begun = self._fit_shortest_segments(point, anchor)
-        if begun.misfit > 0.0:  # the shortest segments were not fitted from here
-            again = self._fit_shortest_segments(point._replace(u=self._fit_short_windows(point.u, anchor)), anchor)
-            begun = min(begun, again, key=lambda one: one.misfit)
+        for held in (anchor, anchor._replace(weight=np.zeros(len(point.u)))):
+            if begun.misfit > 0.0:  # the shortest segments were not fitted from here
+                again = self._fit_shortest_segments(point._replace(u=self._fit_short_windows(point.u, held)), held)
+                begun, anchor = min((begun, anchor), (again, held), key=lambda one: one[0].misfit)
         u, best, levels_done = begun.u, begun.best, [] if begun.first is None else [begun.first]
         for pieces in begun.cuts[1:]:
             try:
@@ -224,7 +226,7 @@ class Search:
             if reading := self._readers_of(part):
                 scatter = np.sqrt(np.mean([np.square(reader.scatter) for reader in reading.values()], axis=0))
                 near.append(np.maximum(_POOR * scatter, _COARSE * part.size[: len(scatter)]))
-        ratio = done.noise.sigma / np.concatenate(near)
+        ratio = done.noise.sigma / (done.residuals.unit * np.concatenate(near))
         return _ShortestSegments(done.trial.u, cuts, best, float(np.mean(np.log(ratio))), done)
 
     def _fit_level(self, pieces: list[Piece], u, best: dict, anchor: Anchor) -> Descent:
@@ -247,7 +249,8 @@ class Search:
         """The u that suits the accelerations of local cubics: these have one minimum where segments are too long."""
         short, states, owners = [], [], []
         for part, scale in zip(self.residuals.parts, self._time_scales(u), strict=True):
-            if np.isfinite(scale) and not jumps(part.scene):
+            last = max((record.ts[-1] for record in part.records), default=0.0)
+            if np.isfinite(scale) and scale > _SHORTEST * abs(last) and not jumps(part.scene):
                 records, begun, of = short_windows(self._readers_of(part), 0.25 * scale)
                 states.append(pad_states(begun, self.residuals.states))
                 short.append(part.with_records(records, np.ones(len(records), bool)))
