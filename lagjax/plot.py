@@ -80,7 +80,7 @@ def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, me
 
     >>> lagjax.plot.trajectory(trajectory); lagjax.plot.trajectory(trajectory, lambda q, qdot: (q[0], qdot[0]))
     """
-    (layout, curves), ax = _curves(trajectory, members), _prepare_axes(ax)
+    (layout, curves), ax = _member_curves(trajectory, members), _prepare_axes(ax)
     if projection is not None:
         periods = _pair_of_periods(period, ax)
         projected = _project_curves(layout, curves, projection)
@@ -170,7 +170,7 @@ def phase(trajectory: Trajectory, *coordinates: str, members: int = 30, period: 
 
     >>> lagjax.plot.phase(trajectory, "q['theta']")
     """
-    (layout, curves), ax = _curves(trajectory, members), _prepare_axes(ax)
+    (layout, curves), ax = _member_curves(trajectory, members), _prepare_axes(ax)
     places, periods = _coordinate_places(layout, coordinates), _angle_periods(layout, period)
     for color, i in zip(COLORS, places, strict=False):
         lines = [wrap_curve(q[:, i], qdot[:, i], periods[i]) for _, q, qdot in curves]
@@ -271,7 +271,7 @@ def modes(modes: Modes, points: Callable | None = None, q: Any = None, params: A
         given, shape = (jax.tree.map(jnp.shape, x) for x in (q, jax.tree.map(lambda leaf: leaf[0], modes.shapes)))
         if given != shape:
             raise ValueError(f"q must be the equilibrium of these modes, with shapes {shape}; got {given}.")
-    shown, shapes = min(_count(count, "count"), len(frequencies)), _align_phases(modes.shapes)
+    shown, shapes = min(_require_count(count, "count"), len(frequencies)), _align_phases(modes.shapes)
     matplotlib = _import_matplotlib()
     if figure is None:
         figure = matplotlib.pyplot.figure(figsize=(min(2.4 * shown + 1.0, 12.8), 3.2), layout="constrained")
@@ -459,7 +459,10 @@ def _stroboscopic_points(scene, over, start: tuple, value: Callable | None, tran
     axes = axes_of(over)
     if len(axes) != 1:
         raise ValueError(f"over must have one axis; got {join_names([axis.dimension for axis in axes])}.")
-    names, times = axes[0].names, 1 + _count(transient, "transient", 0) + np.arange(_count(points, "points"))
+    names, times = (
+        axes[0].names,
+        1 + _require_count(transient, "transient", 0) + np.arange(_require_count(points, "points")),
+    )
     if start[0] is None:
         raise ValueError("strobe is the period of the drive, 2π/ω: give it, or a function of the point.")
     if not any(map(callable, start)) and not (isinstance(start[3], dict) and {*names} & {*start[3]}):
@@ -709,16 +712,18 @@ def _require_numbers(trajectory, name: str) -> None:
     require_numbers(trajectory, "lagjax.plot draws")
 
 
-def _count(count, name: str, least: int = 1) -> int:
+def _require_count(count, name: str, least: int = 1) -> int:
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < least:
         raise ValueError(f"{name} must be a whole number, {('zero', 'one')[least]} at least; got {count!r}.")
     return int(count)
 
 
-def _curves(trajectory: Trajectory, members: int) -> tuple[Layout, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
+def _member_curves(
+    trajectory: Trajectory, members: int
+) -> tuple[Layout, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
     """The curves (t, q, q̇) of at most this many members, evenly chosen, and the layout of their coordinates."""
     _require_numbers(trajectory, "trajectory")
-    chosen = even_places(max(1, np.size(trajectory.ok)), _count(members, "members"))
+    chosen = even_places(max(1, np.size(trajectory.ok)), _require_count(members, "members"))
     layout, courses = courses_of(trajectory, chosen)
     return layout, [course.curve() for course in courses]
 

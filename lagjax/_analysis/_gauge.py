@@ -1,7 +1,7 @@
 """The gauge G(q, t) of a symmetry: the function whose time derivative is the change Λ of L.
 
 Λ = ∂G/∂q·q̇ + ∂G/∂t is affine in q̇, so that ∂G/∂q = ∂Λ/∂q̇ and ∂G/∂t = Λ(q, 0, t). G is their integral along the
-straight line from a reference state, where it is zero; if ∂G/∂q is constant, G = ∂G/∂q·q. `is_right` verifies the
+straight line from a reference state, where it is zero; if ∂G/∂q is constant, G = ∂G/∂q·q. `gauge_holds` verifies the
 numerical integral.
 """
 
@@ -60,7 +60,9 @@ def gauge_of(scene: SceneState, fields: Fields, weights: np.ndarray, k: int, cha
     return _gauge_function(scene, fields, weights, bool(spread and np.abs(at_rest).max() <= _ZERO * size))
 
 
-def is_right(gauge: Callable, scene: SceneState, fields: Fields, k: int, changes: Changes, states: FlatState) -> bool:
+def gauge_holds(
+    gauge: Callable, scene: SceneState, fields: Fields, k: int, changes: Changes, states: FlatState
+) -> bool:
     """True if ∂G/∂q and ∂G/∂t are those of transformation k at some states: each piece of L may have its own G."""
     restore, speeds = scene.layout.restore, fields.scale / fields.time
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from lagjax._analysis._gauge import changes_of, gauge_of, is_right
+from lagjax._analysis._gauge import changes_of, gauge_holds, gauge_of
 from lagjax._analysis._noether import FlatState, charge_at, euler_lagrange, flat_generator, variation
 from lagjax._analysis._potential import absorb_potential_forces
 from lagjax._analysis._random_states import perturb_last_digits, random_states
@@ -344,7 +344,7 @@ def _conserved_quantities(
     changes, states = changes_of(scene, fields, weights, states)
     for k in _select_independent_charges(names, changes.gradients):
         gauge = gauge_of(scene, fields, weights[k], k, changes)
-        if gauge is None or is_right(gauge, scene, fields, k, changes, states):
+        if gauge is None or gauge_holds(gauge, scene, fields, k, changes, states):
             quantities.append(Conserved(names[k], _noether_charge(scene, fields, weights[k], gauge), gauge))
         else:
             notes.append(f"not given: {names[k]}, by a symmetry whose gauge term could not be integrated")
@@ -358,12 +358,12 @@ def _select_independent_charges(names: list[str], gradients: np.ndarray) -> list
     """
     kept = [k for k, name in enumerate(names) if not name.startswith(_DEPENDENT)]
     for k in range(len(names)):
-        if k not in kept and any(_independent_part(of_state[kept], of_state[k]) > 1e-6 for of_state in gradients):
+        if k not in kept and any(_independent_fraction(of_state[kept], of_state[k]) > 1e-6 for of_state in gradients):
             kept.append(k)
     return kept
 
 
-def _independent_part(rows: np.ndarray, row: np.ndarray) -> float:
+def _independent_fraction(rows: np.ndarray, row: np.ndarray) -> float:
     """Return the fraction, 0 to 1, of the length of `row` (2n,) that is orthogonal to the span of `rows` (k, 2n)."""
     size = np.linalg.norm(row)
     if not len(rows) or size == 0:

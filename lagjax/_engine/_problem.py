@@ -230,7 +230,7 @@ class Batch(eqx.Module):
         pairs = zip(params, of_params, strict=True)
         in_front = [x if k is None else (xp := _array_library(x)).moveaxis(xp.asarray(x), k, 0) for x, k in pairs]
         of_state = (jax.tree.structure(values[name]).flatten_up_to(axes[name]) for name in ("q0", "qdot0"))
-        y0 = rows(state, itertools.chain(*of_state), size, layout.dtype)
+        y0 = stack_members(state, itertools.chain(*of_state), size, layout.dtype)
         spread = tuple(None if axis is None else 0 for axis in of_params)
         return cls(one, each, y0, structure.unflatten(in_front), spread)
 
@@ -280,7 +280,9 @@ class Batch(eqx.Module):
         numbers = [(leaf, axis) for leaf, axis in zip(leaves, self.axes, strict=True) if eqx.is_array_like(leaf)]
         if all(axis is None for _, axis in numbers):
             return concatenate_leaves([leaf for leaf, _ in numbers], self.member.layout.dtype)[None]
-        return rows([leaf for leaf, _ in numbers], [axis for _, axis in numbers], len(self), self.member.layout.dtype)
+        return stack_members(
+            [leaf for leaf, _ in numbers], [axis for _, axis in numbers], len(self), self.member.layout.dtype
+        )
 
 
 class Solution(NamedTuple):
@@ -378,7 +380,7 @@ def concatenate_leaves(leaves: list, dtype) -> Float[Numbers, " count"]:
     return np.concatenate([np.zeros(0, dtype), *(np.asarray(leaf, dtype).ravel() for leaf in arrays)])
 
 
-def rows(leaves, axes, size: int, dtype) -> Float[Numbers, "size numbers"]:
+def stack_members(leaves, axes, size: int, dtype) -> Float[Numbers, "size numbers"]:
     """The numbers of every member end to end, shape (size, numbers); `axes` are those of the members, leaf by leaf."""
     library = _array_library(*leaves)
     columns = [library.zeros((size, 0), dtype)]
@@ -451,7 +453,7 @@ def _check_fields(dtype, params, ts, rtol, atol, max_steps, event) -> dict[str, 
     """The fields of a problem that depend neither on its scene nor on its state. Raises where they cannot be right."""
     ts = output_times(ts, dtype)
     require_budget(max_steps, "max_steps")
-    if rtol is not None and (reason := too_tight(require_tolerance(rtol, "rtol"), DOUBLE, LEAST_RTOL)):
+    if rtol is not None and (reason := explain_tight_rtol(require_tolerance(rtol, "rtol"), DOUBLE, LEAST_RTOL)):
         raise ValueError(f"{reason}.")
     if atol is not None:
         require_tolerance(atol, "atol")
@@ -463,7 +465,7 @@ def _check_fields(dtype, params, ts, rtol, atol, max_steps, event) -> dict[str, 
     return dict(params=as_arrays(params, dtype), ts=ts, tolerances=tolerances, max_steps=max_steps, event=event)
 
 
-def too_tight(rtol, dtype, least: float) -> str | None:
+def explain_tight_rtol(rtol, dtype, least: float) -> str | None:
     """Why rtol is too small, where it is below `least` units of round-off."""
     eps = float(jnp.finfo(dtype).eps)
     if not is_concrete(rtol) or float(rtol) >= least * eps:

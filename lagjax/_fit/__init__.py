@@ -49,7 +49,7 @@ from lagjax._fit.search._reader import TimeScales, first_starts, read_records, t
 from lagjax._fit.search._search import Search, search_again
 from lagjax._fit.search._unexplained import Unexplained
 from lagjax._primitives import with_doubles
-from lagjax._run.hybrid import Scene, jumps
+from lagjax._run.hybrid import Scene, may_jump
 from lagjax._scene import HOLDS
 
 PyTree = Any
@@ -239,7 +239,7 @@ class _FitSearch(NamedTuple):
         if that one is not enough: of learned functions, which have one least for a smoothness, evidence says so later.
         Raises `LostMotion` where none can be followed."""
         tell, lost, chooses = _print_line if self.progress else None, None, looks_further and self.starts is None
-        chooses &= len(residuals.parameters) > 0 and any(jumps(part.scene) for part in residuals.parts)
+        chooses &= len(residuals.parameters) > 0 and any(may_jump(part.scene) for part in residuals.parts)
         chooses &= not residuals.parameters.prior_weights.any()
         done, misfits = None, np.zeros(0)
         try:

@@ -102,8 +102,10 @@ class Repetition:
         written = [np.zeros((members, length, *shape)) for shape in of_round]
         sums = [np.zeros((members, *shape)) for shape in self.sums]
         for i, some in _round_members(count, members):
-            before = _take(carry, some)
-            found = go(*_take(x, some), *before, *_take(still, some), *_take(rows, some, i))
+            before = _select_members(carry, some)
+            found = go(
+                *_select_members(x, some), *before, *_select_members(still, some), *_select_members(rows, some, i)
+            )
             behind, new, parts = self.split_results(found)
             for arrays, values in ((written, before if keeps else new), (carry, behind)):
                 for kept, a in zip(arrays, values, strict=True):
@@ -122,16 +124,16 @@ class Repetition:
         carry_ct = [np.repeat(ct, members // len(ct), axis=0) for ct in last]
         for i, some in reversed(_round_members(count, members)):
             given = (
-                *_take(x, some),
-                *_take(before, some, i),
-                *_take(still, some),
-                *_take(rows, some, i),
+                *_select_members(x, some),
+                *_select_members(before, some, i),
+                *_select_members(still, some),
+                *_select_members(rows, some, i),
             )
             found = go(
                 *given,
-                *_take(carry_ct, some),
-                *_take(written, some, i),
-                *_take(sums, some),
+                *_select_members(carry_ct, some),
+                *_select_members(written, some, i),
+                *_select_members(sums, some),
             )
             more, behind = _split(found, self.inputs)
             for total, a in zip(x_ct, more, strict=True):
@@ -148,7 +150,7 @@ def _round_members(count, members: int) -> list[tuple]:
     return [(i, slice(None) if (i < count).all() else np.flatnonzero(i < count)) for i in of_all]
 
 
-def _take(arrays, some, i=slice(None)) -> list:
+def _select_members(arrays, some, i=slice(None)) -> list:
     """The arrays of some members, at round i if it is given; an array with one row is shared by all members."""
     return [x[some, i] if len(x) > 1 else x[:, i] for x in arrays] if isinstance(i, int) else [
         x[some] if len(x) > 1 else x for x in arrays
@@ -325,7 +327,7 @@ def _drop_batch(given, axes: tuple) -> tuple[tuple[int, ...], list[tuple[int, ..
     return tuple(batch), shapes
 
 
-def _shapes(given, of: Repetition) -> list:
+def _forward_shapes(given, of: Repetition) -> list:
     _, first, _, rows, *_ = _split_arguments(given, of)
     return [*first, *((rows[0][0], *shape) for shape in of.of_round), *of.sums]
 
@@ -354,7 +356,7 @@ def _pull_hessian(given, of: Repetition, axes):
     return [*of_x, *_pull_back([*known, *moved], of, narrow)]
 
 
-value_p = _RepeatedMap("value", _shapes, lambda of, *x: of.run(*x[:-1]), _vary_value)
-forward_p = _RepeatedMap("forward", _shapes, _evaluate_forward, _vary_forward, _pull_forward)
+value_p = _RepeatedMap("value", _forward_shapes, lambda of, *x: of.run(*x[:-1]), _vary_value)
+forward_p = _RepeatedMap("forward", _forward_shapes, _evaluate_forward, _vary_forward, _pull_forward)
 back_p = _RepeatedMap("back", _back_shapes, lambda of, *x: of.run_backward(*x), _vary_back, _pull_back)
 hessian_p = _RepeatedMap("hessian", _back_shapes, _evaluate_hessian, _vary_hessian, _pull_hessian)

@@ -19,11 +19,11 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax._engine import Batch, Solution, axes_per_leaf
-from lagjax._engine.taylor import MachineCode, Noted, flow_of, tolerances_of
+from lagjax._engine.taylor import FoundCrossings, MachineCode, flow_of, tolerances_of
 from lagjax._equations import has_constraints
 from lagjax._interface import RESULTS, SUCCESSFUL, as_arrays, code_of, name_of, result_from
 from lagjax._run import Trajectory, restore_crossings, sections_of, simulate, simulate_batch, surfaces_in, trajectory_of
-from lagjax._run.hybrid import Hybrid, jumps
+from lagjax._run.hybrid import Hybrid, may_jump
 from lagjax._sweep._description import NOT_TRACEABLE, Description, Sections
 from lagjax._sweep._files import RESULT, Quantity
 
@@ -37,7 +37,7 @@ PATH_BYTES = 64 * 2**20  # of the path of a batch
 _RAISED = re.compile(r"[\w.]+(Error|Exception|Warning|Interrupt): ")
 
 
-def label(code: int) -> str:
+def result_name(code: int) -> str:
     return NAMES.get(code) or name_of(code)
 
 
@@ -110,7 +110,7 @@ class Batches:
         if self._starts["ts"]:
             ts, wrong = _replace_bad_times(ts, complaints)
         run, crossings = run_batch(description, values, jnp.asarray(ts), self._axes)
-        self._tolerances, self._settings = None if jumps(description.system) else run.tolerances, run.settings
+        self._tolerances, self._settings = None if may_jump(description.system) else run.tolerances, run.settings
         for_members = values["params"] if self._axes[2] == 0 else None
         of_run = _result_arrays(run) | ({"ts": ts} if self._starts["ts"] else {})
         return _BatchMotions(run, (of_run, crossings), for_members), complaints, wrong
@@ -173,7 +173,7 @@ class Batches:
     def _energy_drift(self, arrays: tuple, params: PyTree):
         """|h − h₀| of a member from the first output to the end."""
         scene, run = self.description.system, self._simulate_members(arrays[0], params)
-        if not self.conserves or isinstance(scene, Hybrid) or jumps(scene):
+        if not self.conserves or isinstance(scene, Hybrid) or may_jump(scene):
             return None
         q, qdot = jax.tree.map(lambda x: x[0], (run.q, run.qdot))
         energy, end = scene.energy, run.end
@@ -189,7 +189,7 @@ class Batches:
         complaints = {k: f"keep raised {_describe_error(error)}" for k, error in errors.items()}
         expected = self.quantities or _common_quantities([row for row in rows if row])
         for k, row in enumerate(rows):
-            if row is not None and (wrong := _explain_misfit(expected, row)):
+            if row is not None and (wrong := _explain_mismatch(expected, row)):
                 rows[k], complaints[k] = None, wrong
         kept = {q.name: np.full((len(rows), *q.shape), q.filling, q.dtype) for q in expected}
         for k, row in enumerate(rows):
@@ -283,7 +283,7 @@ def _fill_record(record: Any) -> Any:
     return record._replace(**jax.tree.map(fill, parts))
 
 
-def _explain_misfit(expected: list[Quantity], row: dict[str, np.ndarray]) -> str | None:
+def _explain_mismatch(expected: list[Quantity], row: dict[str, np.ndarray]) -> str | None:
     names = [q.name for q in expected]
     if names != list(row):
         return f"keep returned {list(row)}, of other members {names}"
@@ -301,7 +301,7 @@ def _require_dict(kept: Any) -> None:
             "keep must return a dict that is not empty: names with numbers or arrays, such as {'angle': "
             f"trajectory.q[-1]}}; it returned {type(kept).__name__ if not isinstance(kept, dict) else kept}."
         )
-    names = jax.tree.leaves(names_of(kept))
+    names = jax.tree.leaves(leaf_names(kept))
     for name, leaf in zip(names, jax.tree.leaves(kept), strict=True):
         if names.count(name) > 1:
             raise ValueError(f"keep returns two quantities with the name {name!r} in the store: rename one of them.")
@@ -312,10 +312,10 @@ def _require_dict(kept: Any) -> None:
 
 
 def _arrays_by_name(kept: dict) -> dict[str, np.ndarray]:
-    return dict(zip(jax.tree.leaves(names_of(kept)), map(np.asarray, jax.tree.leaves(kept)), strict=True))
+    return dict(zip(jax.tree.leaves(leaf_names(kept)), map(np.asarray, jax.tree.leaves(kept)), strict=True))
 
 
-def names_of(kept: dict) -> dict:
+def leaf_names(kept: dict) -> dict:
     key = lambda path, _: jax.tree_util.keystr(path, simple=True, separator=".")  # noqa: E731
     return jax.tree_util.tree_map_with_path(key, kept)
 
@@ -347,7 +347,7 @@ def run_batch(description: Description, values: dict[str, PyTree], ts, axes: tup
     are q0, qdot0 and params by name, `axes` their `batch_axes`."""
     system, settings, sections = description.system, description.settings, description.sections
     q0, qdot0, params = values.values()
-    if jumps(system):
+    if may_jump(system):
         tolerances = {name: settings[name] for name in ("rtol", "atol", "max_steps")}
         of_times = None if ts.ndim == 1 else 0
         return _hybrid_batch(system, (*axes[:2], of_times, axes[2]), **tolerances)(q0, qdot0, ts, params), None
@@ -356,7 +356,7 @@ def run_batch(description: Description, values: dict[str, PyTree], ts, axes: tup
     of_leaves, size = axes_per_leaf(values, axes)
     tolerances = (settings[name] for name in ("rtol", "atol", "max_steps"))
     batch = Batch.from_values(system, values, of_leaves, size, ts, *tolerances)
-    solution, noted = _follow_crossings(batch, sections)
+    solution, noted = _find_crossings(batch, sections)
     if len(ts) == 2 and not has_constraints(system):
         params, reached = as_arrays(params, batch.member.layout.dtype), (solution.result == SUCCESSFUL)[:, None]
         ends = np.stack([np.asarray(batch.y0), np.where(reached, solution.y_end, np.nan)], axis=1)  # at both times
@@ -365,12 +365,12 @@ def run_batch(description: Description, values: dict[str, PyTree], ts, axes: tup
         run = simulate_batch(system, q0, qdot0, ts, params, batch_axes=axes, **settings)
         starts = np.asarray(run.result._value) != _INCONSISTENT  # others are not followed, and cross nothing
         t, y = np.where(starts[:, None], noted.t, np.nan), np.where(starts[:, None, None], noted.y, np.nan)
-        noted = Noted(t, y, np.where(starts, noted.count, 0))
+        noted = FoundCrossings(t, y, np.where(starts, noted.count, 0))
     ok = (solution.result == SUCCESSFUL) & (noted.count <= sections.count)
     return run, restore_crossings(batch.member.layout, sections.names, noted, ok)
 
 
-def _follow_crossings(batch: Batch, sections: Sections) -> tuple[Solution, Noted]:
+def _find_crossings(batch: Batch, sections: Sections) -> tuple[Solution, FoundCrossings]:
     """The motions from the first to the last time, and the crossings of G sections, each with that axis in front."""
     section = sections.named_functions() if sections.names else sections.functions[0]
     surfaces = surfaces_in(batch.member, sections_of(section)[1], sections.directions, sections.names)
@@ -380,4 +380,4 @@ def _follow_crossings(batch: Batch, sections: Sections) -> tuple[Solution, Noted
     solution = flow_of(problem).run(ts, y0, params, tolerances)
     path = solution.path.reshape(len(y0), len(sections.functions), sections.count + 1, -1)
     rows = np.moveaxis(path, 1, 0)
-    return solution, Noted(rows[:, :, :-1, 0], rows[:, :, :-1, 1:], rows[:, :, -1, 0])
+    return solution, FoundCrossings(rows[:, :, :-1, 0], rows[:, :, :-1, 1:], rows[:, :, -1, 0])

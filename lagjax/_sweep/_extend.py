@@ -23,7 +23,7 @@ import numpy as np
 from lagjax._interface import SUCCESSFUL
 from lagjax._run import State
 from lagjax._run.hybrid import Hybrid
-from lagjax._sweep._batch import names_of
+from lagjax._sweep._batch import leaf_names
 from lagjax._sweep._description import MOTION, Description, FinalStates, compared_entries, differences
 from lagjax._sweep._files import RESULT, Copied, Files
 from lagjax._sweep._job import require_versions
@@ -130,14 +130,14 @@ class LaterEnd(NamedTuple):
             new.write_copied(unit, Copied(ended, {RESULT.name: result[ended]}, states))
 
 
-def continues(other: Files, description: Description) -> bool:
+def continues_store(other: Files, description: Description) -> bool:
     shared = other.spec()["ts"]
     return shared is not None and float(description.ts[0]) == shared["ends"][1]
 
 
 def later_end_of(other: Files, axes: tuple[Axis, ...], description: Description) -> LaterEnd | None:
     """Return the last states that these motions continue, None if they do not; raise if they cannot."""
-    if not continues(other, description):
+    if not continues_store(other, description):
         return None
     if isinstance(description.system, Hybrid):
         raise ValueError(
@@ -167,5 +167,5 @@ def later_end_of(other: Files, axes: tuple[Axis, ...], description: Description)
 def start_names(description: Description, names: list[str], end: str) -> FinalStates:
     """Return the names of the starts of continued motions, whose ends another store has by the name `end`."""
     q, qdot, _ = description.shapes(names)
-    state = names_of({end: State(jnp.zeros(()), q, qdot)})[end]
+    state = leaf_names({end: State(jnp.zeros(()), q, qdot)})[end]
     return FinalStates(state.q, state.qdot)

@@ -169,6 +169,6 @@ def points_of(axes: list[dict[str, np.ndarray]], shape: tuple[int, ...], which: 
     return {name: values[i] for i, axis in zip(places, axes, strict=True) for name, values in axis.items()}
 
 
-def text_of(point: dict[str, Any]) -> str:
+def point_text(point: dict[str, Any]) -> str:
     """Return a point as text, 'l = 0.5, theta = 1.2', with all digits, so that it can be run again."""
     return ", ".join(f"{name} = {float(value)!r}" for name, value in point.items())

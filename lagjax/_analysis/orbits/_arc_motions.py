@@ -22,7 +22,7 @@ from lagjax._engine.taylor import MachineCode, Motions, flow_of, jvp, tolerances
 from lagjax._equations import Sample, Scales, has_constraints
 from lagjax._interface import SUCCESSFUL, Layout, as_arrays, halves, require_concrete, require_finite, require_number
 from lagjax._primitives import sentence
-from lagjax._run.hybrid import Scene, first_law, jumps, laws, require_scene
+from lagjax._run.hybrid import Scene, first_law, list_laws, may_jump, require_scene
 from lagjax._scene import drop_contacts, require_system
 
 
@@ -84,14 +84,14 @@ class Arcs:
 
     @classmethod
     def from_system(
-        cls, scene: Scene, layout: Layout, params: PyTree, rtol: float, what: str, may_jump: bool = False
+        cls, scene: Scene, layout: Layout, params: PyTree, rtol: float, what: str, jumps: bool = False
     ) -> "Arcs":
-        """Return the arcs of a scene; `what` is for messages; contacts and modes are refused unless `may_jump`."""
-        scene = require_scene(scene) if may_jump else require_system(scene)
-        jumping = JumpingMotions(scene, layout, params, rtol) if jumps(scene) else None
-        require_untraced((laws(scene), params), "A parameter")
+        """Return the arcs of a scene; `what` is for messages; contacts and modes are refused unless it `jumps`."""
+        scene = require_scene(scene) if jumps else require_system(scene)
+        jumping = JumpingMotions(scene, layout, params, rtol) if may_jump(scene) else None
+        require_untraced((list_laws(scene), params), "A parameter")
         system = drop_contacts(first_law(scene))  # whose free motion is for units and charts
-        if any(map(has_constraints, laws(scene))):
+        if any(map(has_constraints, list_laws(scene))):
             raise ValueError(
                 f"{what} cannot be found with constraints yet: give the scene coordinates that need none, angles of "
                 "links instead of positions of their ends."
@@ -232,7 +232,7 @@ _MOST_WRITTEN = 2**26  # numbers of steps of all motions whose shares are sought
 # ---- starts as the user gives them, as rows --------------------------------------------------------------------------
 
 
-def starts(q0: PyTree, qdot0: PyTree, time, name: str) -> tuple[np.ndarray, Layout, np.ndarray]:
+def check_starts(q0: PyTree, qdot0: PyTree, time, name: str) -> tuple[np.ndarray, Layout, np.ndarray]:
     """Check starts and `time`, called `name`, one for all or one per member: times () or (N,), layout, states (N, 2n).
 
     Raises `TypeError` or `ValueError` if they do not fit together, are traced, or not finite.

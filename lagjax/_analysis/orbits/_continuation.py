@@ -23,7 +23,7 @@ import numpy as np
 
 from lagjax._analysis.orbits import _shooting
 from lagjax._analysis.orbits._arc_motions import Arcs
-from lagjax._analysis.orbits._condensation import Condensed, condense
+from lagjax._analysis.orbits._condensation import Condensed, condense_chain
 from lagjax._analysis.orbits._orbit import CLOSED, MOST_ARCS
 from lagjax._analysis.orbits._shooting import Chain, Closing
 from lagjax._equations import decide, span_outside
@@ -103,14 +103,14 @@ class Follower:
     def point(self, y, period, parts, numbers) -> FamilyPoint:
         """Return the chain through these states, (1, K, 2n), and its closing equations."""
         closing = self.closing(numbers)
-        chain = _shooting.follow(closing, y, period, parts, self.units)
+        chain = _shooting.integrate_chain(closing, y, period, parts, self.units)
         columns = [chain.rate[..., None] * np.diff(chain.parts)[..., None, None]] if self.period_is_free else []
         if self.place is not None:
             columns.append(self._parameter_derivatives(closing, y, period, parts, self.place))
         if not chain.ok[0]:
             nothing = np.zeros((0, 0))
             return FamilyPoint(chain, numbers, nothing, Condensed(nothing, nothing, nothing, ()), nothing)
-        condensed = condense(chain.growth, np.concatenate([*columns, chain.defect[..., None]], axis=3))
+        condensed = condense_chain(chain.growth, np.concatenate([*columns, chain.defect[..., None]], axis=3))
         matrix = np.concatenate([condensed.first + condensed.last, condensed.more[..., :-1]], axis=2)[0]
         return FamilyPoint(chain, numbers, matrix, condensed, condensed.more[0, :, -1])
 
@@ -154,7 +154,7 @@ class Follower:
 
     def divide_orbit(self, y0: np.ndarray, period: np.ndarray, count: int, numbers: np.ndarray) -> FamilyPoint:
         """Divide the orbit from a state (1, 2n) with a period (1,), both in the user's units, into `count` arcs."""
-        parts, y = _shooting.guesses(self.closing(numbers), y0, period, count)
+        parts, y = _shooting.guess_states(self.closing(numbers), y0, period, count)
         return self.point(y / self.units.state[:, None], period / self.units.time, parts, numbers)
 
     def slope(self, point: FamilyPoint) -> np.ndarray:
@@ -212,7 +212,7 @@ class FamilyStep(NamedTuple):
     share: float
 
 
-def correct(
+def correct_orbit(
     follower: Follower, point: FamilyPoint, across: FamilyTangent, left_out: int = 0
 ) -> tuple[FamilyPoint, np.ndarray] | None:
     """Return the orbit in the plane across a tangent, and the sizes of Newton's corrections; None if none is found.
@@ -236,7 +236,7 @@ def correct(
 
 def step_along(follower: Follower, last: FamilyPoint, tangent: FamilyTangent, step: float) -> FamilyStep | None:
     """Return the orbit one step further; None if the step was too long for the family."""
-    there = correct(follower, follower.move(last, step * tangent.vector, 0.0), tangent)
+    there = correct_orbit(follower, follower.move(last, step * tangent.vector, 0.0), tangent)
     if there is None:
         return None
     point, sizes = there

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax._analysis.orbits._arc_motions import Arcs, starts
+from lagjax._analysis.orbits._arc_motions import Arcs, check_starts
 from lagjax._interface import SUCCESSFUL, SimulationError, require_flag, show_str
 from lagjax._primitives import accepts_singles, sentence
 from lagjax._run.hybrid import Scene
@@ -86,8 +86,8 @@ def lyapunov_spectrum(
     ```
     """
     require_flag(throw, "throw")
-    durations, layout, y0 = starts(q0, qdot0, duration, "duration")
-    arcs = Arcs.from_system(system, layout, params, rtol, "Lyapunov exponents", may_jump=True)
+    durations, layout, y0 = check_starts(q0, qdot0, duration, "duration")
+    arcs = Arcs.from_system(system, layout, params, rtol, "Lyapunov exponents", jumps=True)
     spans = durations.ravel()
     run = arcs.ends(np.stack([np.zeros_like(spans), spans], axis=1), y0)
     if throw and durations.ndim == 0 and run.result[0] != SUCCESSFUL:
@@ -160,7 +160,7 @@ def lyapunov_exponent(
     lagjax.lyapunov_exponent(scene.system, angles, jnp.zeros((5, 2)), jnp.full(5, 50.0), scene.params).value
     ```
     """
-    durations, layout, y0 = starts(q0, qdot0, duration, "duration")
+    durations, layout, y0 = check_starts(q0, qdot0, duration, "duration")
     arcs = Arcs.from_system(system, layout, params, rtol, "Lyapunov exponents")
     some = [slice(k, k + _MEMBERS) for k in range(0, len(y0), _MEMBERS)]
     value, error = np.concatenate([_largest_exponent(arcs, y0[x], durations.ravel()[x]) for x in some], axis=1)

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax._analysis.orbits import _shooting
-from lagjax._analysis.orbits._arc_motions import Arcs, starts
-from lagjax._analysis.orbits._floquet import UNCERTAIN, UNSTABLE, multipliers_of, pairing_error, reduce
+from lagjax._analysis.orbits._arc_motions import Arcs, check_starts
+from lagjax._analysis.orbits._floquet import UNCERTAIN, UNSTABLE, multipliers_of, pairing_error, reduce_arcs
 from lagjax._analysis.orbits._shooting import Chain, Closing
 from lagjax._equations import decide, singular_threshold
 from lagjax._interface import SUCCESSFUL, Layout, SimulationError, halves, require_finite, require_flag, require_number
@@ -134,9 +134,9 @@ def periodic_orbit(
     ```
     """
     require_flag(throw, "throw")
-    periods, layout, y0 = starts(q0, qdot0, period, "period")
-    arcs = Arcs.from_system(system, layout, params, RTOL, "Periodic orbits", may_jump=True)
-    found = find(_closing_conditions(arcs, energy, image), y0, periods.ravel())
+    periods, layout, y0 = check_starts(q0, qdot0, period, "period")
+    arcs = Arcs.from_system(system, layout, params, RTOL, "Periodic orbits", jumps=True)
+    found = find_orbits(_closing_conditions(arcs, energy, image), y0, periods.ravel())
     if periods.ndim == 0:
         if throw and not found.ok[0]:
             raise SimulationError(found.message[0], None)
@@ -189,7 +189,7 @@ class FlatOrbits(NamedTuple):
     message: np.ndarray  # of text
 
 
-def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrbits:
+def find_orbits(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrbits:
     """Return the orbits near these guesses; one that does not close well is tried with more arcs while that helps."""
     arcs = closing.arcs
     counts = arc_counts(arcs, y0, period)
@@ -201,9 +201,9 @@ def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrbits:
         for count in np.unique(counts[waiting]).tolist():
             members = waiting[counts[waiting] == count]
             for some in np.array_split(members, -(-len(members) * count // _PORTION)):
-                parts, y = _shooting.guesses(closing, y0[some], period[some], count)
+                parts, y = _shooting.guess_states(closing, y0[some], period[some], count)
                 units = arcs.units(y0[some], period[some])
-                trial = assess_orbits(closing, _shooting.close(closing, y, period[some], parts, units))
+                trial = assess_orbits(closing, _shooting.close_chains(closing, y, period[some], parts, units))
                 better = ~(found.closure[some] <= trial.closure)
                 gained[some] = better | ~found.ok[some]
                 found = _shooting.replace_members(found, some[better], FlatOrbits(*(x[better] for x in trial)))
@@ -233,9 +233,9 @@ def assess_orbits(closing: Closing, chain: Chain, most: int | None = None) -> Fl
     multipliers = np.full((len(ok), chain.y.shape[2]), np.nan, complex)
     if ok.any():
         closed = chain.select(ok)
-        known = _shooting.symmetries(closed, most)
+        known = _shooting.find_null_spaces(closed, most)
         for k, place in enumerate(np.flatnonzero(ok).tolist()):
-            multipliers[place] = multipliers_of(reduce(closed.growth[k], *known[k]), closing.arcs.conserves)
+            multipliers[place] = multipliers_of(reduce_arcs(closed.growth[k], *known[k]), closing.arcs.conserves)
     stable = np.abs(np.where(np.isnan(multipliers), np.inf, multipliers)).max(axis=1) < 1 + UNSTABLE
     off = np.array([pairing_error(row) if closing.arcs.conserves else 0.0 for row in multipliers])
     for place in np.flatnonzero(ok & (off > UNCERTAIN)).tolist():

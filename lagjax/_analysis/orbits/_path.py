@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax._analysis.orbits._arc_motions import Arcs, Units
-from lagjax._analysis.orbits._shooting import Chain, Closing, close, equations
+from lagjax._analysis.orbits._shooting import Chain, Closing, close_chains, condense_equations
 from lagjax._engine import concatenate_leaves
 from lagjax._equations import decide
 from lagjax._interface import Layout, SimulationError, as_arrays, halves, require_finite, require_flag, require_number
@@ -191,7 +191,7 @@ def find_path(
     first = _guess_states(layout, guess, ends, times)
     closing = Closing.plain(arcs)._replace(t_first=times[0], q_end=ends[1])
     parts = np.linspace(0.0, 1.0, _ARCS + 1)[None]
-    chain = close(closing, first[None], times[-1:] - times[:1], parts, _path_units(arcs, first, ends, times))
+    chain = close_chains(closing, first[None], times[-1:] - times[:1], parts, _path_units(arcs, first, ends, times))
     message = _explain_no_path(closing, chain, times)
     if message:
         if throw:
@@ -237,7 +237,7 @@ def _explain_no_path(closing: Closing, chain: Chain, times) -> str:
     missed = float(chain.closure()[0])
     if missed <= _CLOSED:
         return ""
-    singular = equations(closing, chain).decided.rank[0] < chain.y.shape[2]
+    singular = condense_equations(closing, chain).decided.rank[0] < chain.y.shape[2]
     end = " The ends are conjugate to each other: neighbouring paths all meet there, or none does." if singular else ""
     return (
         f"No path was found {between}: the motions that were tried miss each other by {missed:.2g} of their "

@@ -23,7 +23,7 @@ import jax
 import numpy as np
 
 from lagjax._analysis.orbits._arc_motions import Arcs, Units
-from lagjax._analysis.orbits._condensation import Condensed, condense
+from lagjax._analysis.orbits._condensation import Condensed, condense_chain
 from lagjax._equations import Decided, decide, singular_threshold
 
 Members = TypeVar("Members")
@@ -140,7 +140,7 @@ def replace_members(members: Members, places: np.ndarray, others: Members) -> Me
     return jax.tree.map(replace, members, others)
 
 
-def guesses(closing: Closing, y0: np.ndarray, period: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def guess_states(closing: Closing, y0: np.ndarray, period: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return fractions (B, K + 1) of the period and states (B, K, 2n) there, from starts (B, 2n).
 
     The motion is integrated from both ends to the middle, if the scene is not driven. K is a power of two.
@@ -159,7 +159,7 @@ def guesses(closing: Closing, y0: np.ndarray, period: np.ndarray, count: int) ->
     return parts, np.concatenate([first, second[:, -2:0:-1]], axis=1)
 
 
-def follow(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray, units: Units) -> Chain:
+def integrate_chain(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray, units: Units) -> Chain:
     """Integrate the arcs from these states, (B, K, 2n), all in these units: a `Chain`."""
     arcs, (chains, count, states) = closing.arcs, y.shape
     of_state, spans = units.state[:, None], (period * units.time)[:, None]
@@ -196,8 +196,10 @@ class NewtonEquations(NamedTuple):
     right: np.ndarray
 
 
-def equations(closing: Closing, chain: Chain) -> NewtonEquations:
-    condensed = condense(chain.growth, np.stack([chain.rate * np.diff(chain.parts)[..., None], chain.defect], axis=3))
+def condense_equations(closing: Closing, chain: Chain) -> NewtonEquations:
+    condensed = condense_chain(
+        chain.growth, np.stack([chain.rate * np.diff(chain.parts)[..., None], chain.defect], axis=3)
+    )
     of_first, of_last = closing.free()
     regular, of_period = condensed.first @ of_first + condensed.last @ of_last, condensed.more[..., :1]
     # A condition in units of the state, as the defects are.
@@ -214,9 +216,9 @@ def equations(closing: Closing, chain: Chain) -> NewtonEquations:
     return NewtonEquations(condensed, decide(matrix, threshold), right)
 
 
-def correction(closing: Closing, chain: Chain) -> tuple[np.ndarray, np.ndarray]:
+def newton_correction(closing: Closing, chain: Chain) -> tuple[np.ndarray, np.ndarray]:
     """Return the Newton step of least norm: dy (B, K, 2n), dT (B,); 0 if the ends of a path are conjugate."""
-    condensed, decided, right = equations(closing, chain)
+    condensed, decided, right = condense_equations(closing, chain)
     step, states = -decided.least_norm(right), chain.y.shape[2]
     period = np.zeros(len(step)) if closing.lasts else step[:, -1]
     first, last = (step[:, :states] @ of.T for of in closing.free())
@@ -227,9 +229,9 @@ def correction(closing: Closing, chain: Chain) -> tuple[np.ndarray, np.ndarray]:
     return dy, period
 
 
-def close(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray, units: Units) -> Chain:
+def close_chains(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray, units: Units) -> Chain:
     """Find the closed chains, or joined paths, near these states; `Chain.closure` is the remaining error."""
-    chain = follow(closing, y / units.state[:, None], period / units.time, parts, units)
+    chain = integrate_chain(closing, y / units.state[:, None], period / units.time, parts, units)
     active = chain.ok.copy()
     for _ in range(_TRIALS):
         active &= chain.merit() > _ENOUGH * chain.size()
@@ -245,13 +247,13 @@ def close(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray
 
 def _damped_newton_step(closing: Closing, chain: Chain) -> Chain:
     """Return each chain after the largest fraction of a Newton step that lowers its defect."""
-    dy, dperiod = correction(closing, chain)
+    dy, dperiod = newton_correction(closing, chain)
     longest = np.minimum(1.0, 0.25 * chain.period / np.maximum(np.abs(dperiod), 1e-300))
     best, waiting = chain, np.arange(len(chain.period))
     for share in _SHARES if closing.q_end is None else _SHARES_OF_PATH:
         here, scale = chain.select(waiting), share * longest[waiting]
         y, period = here.y + scale[:, None, None] * dy[waiting], here.period + scale * dperiod[waiting]
-        trial = follow(closing, y, period, here.parts, here.units)
+        trial = integrate_chain(closing, y, period, here.parts, here.units)
         lower = trial.merit() < (1 - 0.25 * scale) * here.merit()
         near = here.merit() < 1e3 * _ENOUGH * here.size()  # where rounding decides
         best = replace_members(best, waiting[lower], trial.select(lower))
@@ -268,7 +270,7 @@ class Symmetries(NamedTuple):
     of_transpose: np.ndarray
 
 
-def symmetries(chain: Chain, most: int | None = None) -> list[Symmetries]:
+def find_null_spaces(chain: Chain, most: int | None = None) -> list[Symmetries]:
     """Return the null spaces of closed chains, of at most `most` dimensions, by the smallest singular values.
 
     A branch point has one more dimension than the symmetries, which `most` excludes.
@@ -287,7 +289,7 @@ def symmetries(chain: Chain, most: int | None = None) -> list[Symmetries]:
 def _closure_null_vectors(growth: np.ndarray) -> tuple[Decided, np.ndarray]:
     """Return the rank of A + B of closed chains, and the right singular vectors at all states, (B, K, 2n, 2n)."""
     chains, count, states, _ = growth.shape
-    condensed = condense(growth, np.zeros((chains, count, states, 0)))
+    condensed = condense_chain(growth, np.zeros((chains, count, states, 0)))
     rank = decide(condensed.first + condensed.last, RANK)
     return rank, condensed.inner(rank.right, rank.right, np.zeros((chains, 0, states)))
 

@@ -28,7 +28,7 @@ from lagjax._program import Unlowerable
 _BEFORE = 64 * np.finfo(np.float64).eps  # of the largest time: more than the rounding of a time, and of a border's
 
 
-class Noted(NamedTuple):
+class FoundCrossings(NamedTuple):
     """The crossings of each of G surfaces, at most `room`, NaN after the last one."""
 
     t: Any  # (G, room)
@@ -36,7 +36,7 @@ class Noted(NamedTuple):
     count: Any  # (G,), how many there were
 
     @classmethod
-    def read(cls, path, surfaces: int) -> "Noted":
+    def read(cls, path, surfaces: int) -> "FoundCrossings":
         """The crossings in the `path` of a motion that records them, (G (room + 1), 2n + 1)."""
         rows = path.reshape(surfaces, -1, path.shape[-1])
         return cls(rows[:, :-1, 0], rows[:, :-1, 1:], rows[:, -1, 0])
@@ -136,7 +136,7 @@ def _event_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
     return run_unguarded
 
 
-def run_stretch(
+def integrate_stretch(
     flow: Flow, surfaces: Surfaces | None, tolerances: Tolerances, ts, y0, params, t_end, y_end, k, crosses
 ) -> tuple:
     """The path, the end time, and the state there, of a motion from ts[0] to `t_end`; surface k `crosses` there.
@@ -163,15 +163,15 @@ def run_stretch(
 
 def motion_with_crossings(
     noting: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params
-) -> tuple[Solution, Noted]:
+) -> tuple[Solution, FoundCrossings]:
     """The motion to the last of `ts`, and its crossings, with first and second derivatives."""
     still = jax.lax.stop_gradient
     solution = jax.tree.map(still, _primitives.run(noting, tolerances, still(ts), still(y0), still(params)))
-    noted = Noted.read(solution.path, len(surfaces.directions))
+    noted = FoundCrossings.read(solution.path, len(surfaces.directions))
     run_again = _crossings_variation(flow, surfaces, tolerances._replace(notes=0))
     t, y = attach_derivative(run_again, (noted.t, noted.y), ts, y0, params, noted.t)
     there, inputs = jnp.isfinite(noted.t), (ts, y0, params)
-    return solution, Noted(
+    return solution, FoundCrossings(
         undefined_unless(there, t, inputs), undefined_unless(there[..., None], y, inputs), noted.count
     )
 

@@ -305,7 +305,7 @@ def _record_steps(flow: Flow, motions: Motions, tolerances: Tolerances) -> Itera
 
     To keep those of the first run would save a twentieth of the time in most cases, and a fifth at most.
     """
-    for places in portions(np.arange(len(motions.y0)), motions.accepted * (flow.states + 4), LARGEST_PORTION):
+    for places in split_portions(np.arange(len(motions.y0)), motions.accepted * (flow.states + 4), LARGEST_PORTION):
         again = motions.take(places)
         room = _ROOM_AGAIN * int(again.accepted.sum()) + int(again.rejected.sum()) + len(places)
         for steps in flow.follow(*again[:3], tolerances, room)[1]:
@@ -363,7 +363,7 @@ def _divide_steps(flow: Flow, steps: Steps, params, tolerances: Tolerances) -> S
     return cut_steps(flow, steps, cuts, params, tolerances)
 
 
-def portions(places: np.ndarray, numbers: np.ndarray, largest: int) -> list[np.ndarray]:
+def split_portions(places: np.ndarray, numbers: np.ndarray, largest: int) -> list[np.ndarray]:
     """The indices `places` in portions that need at most `largest` numbers together, or a single index."""
     if not len(places):
         return []

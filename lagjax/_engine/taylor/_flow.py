@@ -200,7 +200,7 @@ class Flow:
         if not (result == SUCCESSFUL).all():
             again, flow, tolerances = self._members_to_repeat(solution, ts, params, tolerances)
             if again.any():
-                some_ts, some_y0, some_params = members(again, ts, y0, params)
+                some_ts, some_y0, some_params = select_members(again, ts, y0, params)
                 better, steps_again = flow.follow(some_ts, some_y0, some_params, tolerances, room)
                 for values, new in zip(solution[:-1], better[:-1], strict=True):
                     values[again] = new
@@ -272,6 +272,6 @@ class Flow:
         return Flow(parts, rows * n, rows * self.numbers, None, groups, nesting, general, self._motion_program)
 
 
-def members(chosen: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:
+def select_members(chosen: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:
     """The rows where the mask `chosen` (N,) is true, of each array; an array of one row is shared by all."""
     return [x[chosen] if len(x) == len(chosen) else x for x in arrays]

@@ -41,7 +41,7 @@ from lagjax._engine.taylor._call import (
 from lagjax._engine.taylor._derivatives import Motions
 from lagjax._engine.taylor._flow import Flow, Tolerances
 from lagjax._engine.taylor._gpu_launch import run_on_gpu, transpose_on_gpu
-from lagjax._engine.taylor._line_functions import outputs
+from lagjax._engine.taylor._line_functions import program_outputs
 from lagjax._engine.taylor._passages import has_passages
 from lagjax._engine.taylor._state_rates import rate
 from lagjax._engine.taylor._variational import from_rows, to_rows
@@ -190,7 +190,9 @@ def _project_direction(flow: Flow, t, y0, params, dy0, dparams):
 
     def differentiate_start(t, y, p, dy, dp):
         def start(y, p):
-            return outputs(cast(Program, cast(Projection, flow.projection).state), flow.states, jnp.append(y, t), p)
+            return program_outputs(
+                cast(Program, cast(Projection, flow.projection).state), flow.states, jnp.append(y, t), p
+            )
 
         return jax.jvp(start, (y, p), (dy, dp))[1]
 

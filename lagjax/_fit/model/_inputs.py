@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._run.hybrid import Hybrid, Scene, Transition, laws
+from lagjax._run.hybrid import Hybrid, Scene, Transition, list_laws
 from lagjax._scene import (
     MARGINS,
     DrivenParams,
@@ -103,7 +103,7 @@ def split_leaves(flat, tree, shapes: tuple[tuple[int, ...], ...]) -> PyTree:
 
 
 def input_functions(scene: Scene) -> list[str]:
-    return [role for law in laws(scene) for role in roles_with_inputs(law)]
+    return [role for law in list_laws(scene) for role in roles_with_inputs(law)]
 
 
 def table_length(count: int) -> int:

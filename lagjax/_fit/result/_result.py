@@ -30,7 +30,7 @@ from lagjax._fit.search._descent import Descent
 from lagjax._fit.search._multistart import Waterfall
 from lagjax._fit.search._unexplained import Unexplained, measure_unexplained
 from lagjax._primitives import with_doubles
-from lagjax._show import cell, import_package
+from lagjax._show import html_cell, import_package
 
 PyTree = Any
 
@@ -144,7 +144,7 @@ class Fit:
     @with_doubles
     def _repr_html_(self) -> str | None:
         """The lab book, and data over fit of the first record, for notebooks; None where nothing can be drawn."""
-        return cell(repr(self), self._draw_first, (5.2, 2.8))
+        return html_cell(repr(self), self._draw_first, (5.2, 2.8))
 
     def _draw_first(self, figure) -> None:
         parts = self.residual_function.parts

@@ -31,7 +31,7 @@ from lagjax._fit.model._transforms import Between, Positive
 from lagjax._fit.result._information import Information, eliminate_starts, information
 from lagjax._fit.search._descent import Descent, column_norms, eliminate
 from lagjax._fit.search._unexplained import MOST_NAMED, Unexplained, measure_unexplained, unexplained_motion
-from lagjax._run.hybrid import jumps
+from lagjax._run.hybrid import may_jump
 
 _BEYOND = 2.0  # standard errors that a step must lead beyond a bound: of sound fits at a bound one in forty does
 _CORRELATED = 0.5
@@ -48,7 +48,7 @@ def verdict(
 ) -> tuple[bool, str]:
     """Judge if a fit can be relied upon, and say why; `left` is what the best of `starts` searches left."""
     residuals, parts = descent.residuals, [descent.message]
-    strikes = any(jumps(part.scene) for part in residuals.parts)
+    strikes = any(may_jump(part.scene) for part in residuals.parts)
     more, astray = max(64, 4 * starts), strikes and _leaves_motion(known, left)
     if known.confirmed.shape[1] and strikes:
         text = f"Take starts={more}; else fix it, or measure more."
@@ -125,7 +125,7 @@ def _describe_bends(descent: Descent, known: Information) -> list[str]:
     """Sentences for numbers that all records share, where the likelihood falls on one side by less than half of what an
     interval says."""
     residuals, trial, found = descent.residuals, descent.trial, []
-    if known.null.shape[1] or not any(jumps(part.scene) for part in residuals.parts):
+    if known.null.shape[1] or not any(may_jump(part.scene) for part in residuals.parts):
         return found
     parameters, best = residuals.parameters, residuals.log_likelihood(trial, descent.noise)
     labels, deviations = parameters.labels, _deviations(known)

@@ -30,7 +30,7 @@ from lagjax._fit.search._descent import Anchor, Descent, minimise
 from lagjax._fit.search._multistart import misfit
 from lagjax._fit.search._reader import Reader, pad_states, short_windows, time_scales
 from lagjax._fit.search._unexplained import measure_unexplained
-from lagjax._run.hybrid import jumps
+from lagjax._run.hybrid import may_jump
 from lagjax._show import even_places
 
 # In units of half the sum of squares: the end of a search, where parameters are within 0.05 standard deviations of
@@ -55,7 +55,7 @@ class Search:
 
     def __init__(self, residuals: Residuals, law: AbstractNoise, method: str, readers: list[Reader | None]):
         self.residuals, self.law, self.method = residuals, law, method
-        hybrid = [jumps(part.scene) for part in residuals.parts for _ in part.records]
+        hybrid = [may_jump(part.scene) for part in residuals.parts for _ in part.records]
         if method == "segments" and all(hybrid):
             raise ValueError('method="segments" cannot cut hybrid motion, whose mode is known at the start: leave it.')
         self.readers = [None if is_hybrid else reader for is_hybrid, reader in zip(hybrid, readers, strict=True)]
@@ -122,7 +122,9 @@ class Search:
     def _knows_starts(self) -> bool:
         """True where "auto" may begin with the first samples of records: all starts are known, and no motion jumps."""
         residuals = self.residuals
-        plain = not any(jumps(part.scene) or part.clocks or part.signals.delays is not None for part in residuals.parts)
+        plain = not any(
+            may_jump(part.scene) or part.clocks or part.signals.delays is not None for part in residuals.parts
+        )
         return self.method == "auto" and plain and not any(self.readers) and not residuals.fitted.any()
 
     def _search_beginnings(self, point: Point, done: Descent | None) -> Descent | None:

@@ -25,7 +25,7 @@ from lagjax._native.code._constants import (
     RUNNING,
     SMALLEST_STEP,
 )
-from lagjax._native.code._frame import Frame, Lane, job
+from lagjax._native.code._frame import Frame, Lane, job_structure
 from lagjax._native.code._ir import INTEGER, POINTER, Code, Value
 from lagjax._native.series._guards import Guards
 from lagjax._native.series._motion_parts import MotionParts
@@ -35,10 +35,10 @@ from lagjax._native.steps._border_control import BorderControl
 from lagjax._native.steps._events import Events
 from lagjax._native.steps._projection import Projector
 from lagjax._native.steps._roots import Roots
-from lagjax._native.steps._run_records import Output
+from lagjax._native.steps._run_records import OutputWriter
 from lagjax._native.steps._step import PARTS, StepControl
 
-JOB = job(
+JOB = job_structure(
     "Job",
     ("next_member", "ts", "y0", "params", "path", "y_end", "t_end", "code", "steps", "rejected", "record", "next_row"),
     # Strides from one member to the next: 0 where all share the output times, or the parameters.
@@ -59,10 +59,12 @@ class Integrator:
         self.base_size = nesting.base
         self.guards = 0 if guards is None else len(guards.directions)
         self.notes = guards is not None and guards.notes  # in the place of states at output times
-        fields = StepControl.fields(n) | Output.fields(n) | Events.fields(self.guards)
+        fields = StepControl.fields(n) | OutputWriter.fields(n) | Events.fields(self.guards)
         fields["active"] = 1  # 1 in a lane that has a member
         if projection is not None:
-            self.begins = _rank_drops.beginning(2 * n, self.guards, 0 if borders is None else len(borders.guards))
+            self.begins = _rank_drops.step_start_fields(
+                2 * n, self.guards, 0 if borders is None else len(borders.guards)
+            )
             fields |= Projector.fields(n) | _rank_drops.fields(self.begins)
         if guards is not None:
             fields |= Roots.fields(MAX_ORDER + 2)
@@ -76,7 +78,7 @@ class Integrator:
         groups = tuple(range(n)) if error_groups is None else error_groups
         self.step = StepControl(motion, groups, self.projector, self.base_size)
         self.borders = borders and BorderControl(motion, borders, nesting, projection is not None, jump)
-        self.output = Output(motion, self.projector)
+        self.output = OutputWriter(motion, self.projector)
         roots = Roots(motion) if guards and self.borders is None else self.borders and self.borders.roots
         self.events = guards and roots and Events(motion, self.step, self.output, roots, guards)
         self.start_next = self._start_next()
@@ -164,7 +166,7 @@ class Integrator:
             if crossings is not None:
                 frame.call(crossings.crossing.cross)
             if self.projector is not None:
-                _rank_drops.shorten(frame)
+                _rank_drops.shorten_returned(frame)
             self._finish_members(frame, idle)
         frame.finish(self.motion.is_unfinished(frame))
 

@@ -13,7 +13,7 @@ and that of each step replaces its number in the record.
 
 import functools
 
-from lagjax._native.code._frame import Frame, Lane, job
+from lagjax._native.code._frame import Frame, Lane, job_structure
 from lagjax._native.code._ir import INTEGER, Code, Value
 from lagjax._native.motions._maps import CauchyProducts, OrderRecursion, ProjectedEnd, SeriesSum, ZerothOrder
 from lagjax._native.motions._recorded_steps import StepReplay
@@ -22,7 +22,7 @@ from lagjax._native.series._tangent_memory import Directions
 from lagjax._native.steps._run_records import NUMBER, instant_tolerance
 
 # `y_dot` is the tangent of the start, and becomes that of the end.
-JOB = job(
+JOB = job_structure(
     "TangentJob",
     ("next_member", "ts", "params", "record", "first_step", "steps", "path_dot", "y_dot", "params_dot", "excess"),
     ("ts_stride", "params_stride", "members", "times", "order", "directions"),

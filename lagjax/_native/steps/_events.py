@@ -17,7 +17,7 @@ from lagjax._native.code._ir import INTEGER, Code, Value, Variable
 from lagjax._native.series._guards import Guards
 from lagjax._native.series._taylor import TaylorSeries, double
 from lagjax._native.steps._roots import Roots
-from lagjax._native.steps._run_records import Output
+from lagjax._native.steps._run_records import OutputWriter
 from lagjax._native.steps._step import StepControl
 from lagjax._native.steps._watch import END_OF_STEP, Columns, Touch, Watch, reaches_border
 from lagjax._program import inputs_below
@@ -36,7 +36,7 @@ MEMORY = ("side", "contact", "noted")  # of each guard from step to step
 class Events:
     """The kernel functions that find sign changes of guards, which are the last followed outputs."""
 
-    def __init__(self, motion: TaylorSeries, step: StepControl, output: Output, roots: Roots, guards: Guards):
+    def __init__(self, motion: TaylorSeries, step: StepControl, output: OutputWriter, roots: Roots, guards: Guards):
         self.motion, self.step, self.roots, self.guards = motion, step, roots, guards
         self.count = len(guards.directions)
         self.first = motion.series.followed - self.count
@@ -400,7 +400,7 @@ class Events:
 
     # ---- what is noted ----
 
-    def _write_change(self, output: Output) -> Code:
+    def _write_change(self, output: OutputWriter) -> Code:
         """Emit `(order, g, s)`: record a change of guard g and the state there, in the lanes that are due."""
         frame = self.motion.function("note_change", INTEGER, INTEGER, self.motion.vector)
         code, (order, g, s) = frame.code, frame.arguments

@@ -16,7 +16,7 @@ def instant_tolerance(code: Code, t: Value) -> Value:
     return _INSTANT * abs(t)
 
 
-class Output:
+class OutputWriter:
     """The kernel functions that write into the arrays of the job."""
 
     def __init__(self, motion: TaylorSeries, projector: Projector | None):

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 
-from lagjax._native.code._frame import Fields, Frame, Index, integers
+from lagjax._native.code._frame import Fields, Frame, Index, integer_constant
 from lagjax._native.code._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native.series._taylor import TaylorSeries
 from lagjax._program import Affine, Borders, Level
@@ -113,7 +113,7 @@ class Columns:
     def __init__(self, module: ir.Module, names: Sequence[str], rows: Sequence, kind: ir.Type = INTEGER):
         self.count = len(rows)
         numbers = np.array(rows or [[0]], np.int64 if kind == INTEGER else float)
-        self._names, self._kind, self._data = names, kind, integers(module, numbers.view(np.int64))
+        self._names, self._kind, self._data = names, kind, integer_constant(module, numbers.view(np.int64))
 
     def read(self, code: Code, row: Value, name: str) -> Value:
         place = row * len(self._names) + self._names.index(name)

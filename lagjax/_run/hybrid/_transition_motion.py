@@ -60,7 +60,7 @@ def hybrid_motion(plan: HybridPlan, layout: Layout, ts, y0, params: PyTree, star
     return _arrange_outcome(plan, layout, replay, *replay.follow(*given), given[:3])
 
 
-def follow_concrete(plan: HybridPlan, layout: Layout, params: PyTree, ts, y0, vectors, start) -> Ending:
+def integrate_concrete(plan: HybridPlan, layout: Layout, params: PyTree, ts, y0, vectors, start) -> Ending:
     """The motions of N members with concrete numbers: `y0` (N, 2n), `ts` (N or 1, T), `vectors` (N, P).
 
     `params` are those of one member; all begin in mode number `start`.

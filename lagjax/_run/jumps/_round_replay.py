@@ -32,7 +32,7 @@ def mask_rows(there, x, inputs: tuple):
     return undefined_unless(there, x, inputs) if inputs else np.where(there, x, np.nan)
 
 
-def join(*arrays):
+def concatenate(*arrays):
     return jnp.concatenate([jnp.ravel(x) for x in arrays])
 
 

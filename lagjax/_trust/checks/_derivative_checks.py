@@ -4,9 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from lagjax._equations import describe_pieces, offenders
+from lagjax._equations import describe_decisions, find_offenders
 from lagjax._interface import join_names
-from lagjax._trust.checks._differences import Slopes, differ, ladder, slopes
+from lagjax._trust.checks._differences import Slopes, slopes, slopes_differ, step_ladder
 from lagjax._trust.checks._findings import Finding
 from lagjax._trust.checks._jumps_near import OF_FORCE
 from lagjax._trust.checks._scene_at_start import CheckedScene
@@ -82,7 +82,7 @@ def _blame_phrase(scene: CheckedScene, role: str, order: str) -> str:
     """Return the end of a sentence: the operation, its operands, its line of code, and what to write instead."""
     wanted = {"value": ("value",), "first": ("value", "first derivative")}.get(order)
     offending = [
-        o for o in offenders(getattr(scene.written_motion, role), *scene.state) if not wanted or o.fault in wanted
+        o for o in find_offenders(getattr(scene.written_motion, role), *scene.state) if not wanted or o.fault in wanted
     ]
     if not offending:
         return ". No single operation is to blame: large numbers may overflow together; look at the units."
@@ -134,8 +134,8 @@ def _compare_derivatives(scene: CheckedScene, sides, name, role, derivative, dir
         sides.minus[chosen], m.here[list(outputs)], sides.plus[chosen], scene.steps[:, list(directions)], place,
         float(np.finfo(dtype).eps), sides.noise[list(outputs)],
     )  # fmt: skip
-    kinks, n = differ(ahead, behind, dtype), scene.layout.size
-    derivative, wrong = derivative.value, differ(derivative, both, dtype) & ~kinks
+    kinks, n = slopes_differ(ahead, behind, dtype), scene.layout.size
+    derivative, wrong = derivative.value, slopes_differ(derivative, both, dtype) & ~kinks
     names = [names[i] for i in directions]
     for i, k in list(zip(*np.nonzero(kinks), strict=True))[:_SHOWN]:
         of_velocity = name == "L" and directions[i] >= n
@@ -150,7 +150,7 @@ def _kink_finding(scene: CheckedScene, name: str, role: str, along: str, values,
     below, above, derivative = values
     slope = f"The slope of {name} along {along} is {below:.6g} below this state and {above:.6g} above it"
     if role in ("lagrangian", "dissipation"):
-        pieces = describe_pieces([getattr(scene.written_motion, role)], scene.state)
+        pieces = describe_decisions([getattr(scene.written_motion, role)], scene.state)
         slope += f" (the function is pieced together by {pieces})" if pieces else ""
     of_force = role == "dissipation" or (role == "lagrangian" and not of_velocity)
     if of_force:
@@ -234,13 +234,13 @@ def _restrict(direction: np.ndarray, part) -> np.ndarray:
 def _off_line(scene: CheckedScene, direction: np.ndarray) -> tuple[np.ndarray, Slopes, Slopes, Slopes, np.ndarray]:
     """Return flags (2, 5) of kinks and wrong derivatives along a direction; both, one-sided slopes; derivatives."""
     n, dtype = scene.layout.size, scene.layout.dtype
-    steps = ladder(np.array([scene.sizes[-1] if direction[-1] else 1.0]), dtype)
+    steps = step_ladder(np.array([scene.sizes[-1] if direction[-1] else 1.0]), dtype)
     line, eps = scene.line(direction, steps[:, 0]), float(np.finfo(dtype).eps)
     place = np.abs(direction) @ (_input_magnitudes(scene) / scene.sizes**2)
     sides = slopes(line.minus[None], line.here, line.plus[None], steps, np.array([place]), eps, 4 * eps * line.terms)
     both, ahead, behind = sides
-    kinks = differ(ahead, behind, dtype)[0]
-    wrong = differ(Slopes(line.derivative[None], 0 * line.derivative[None]), both, dtype)[0] & ~kinks
+    kinks = slopes_differ(ahead, behind, dtype)[0]
+    wrong = slopes_differ(Slopes(line.derivative[None], 0 * line.derivative[None]), both, dtype)[0] & ~kinks
     if direction[:n].any() or direction[-1]:
         kinks[2] = wrong[2] = False  # of D only the slope by velocities counts
     return np.stack([kinks, wrong]), both, ahead, behind, line.derivative

@@ -36,7 +36,7 @@ from jaxtyping import Array, Bool, Float, Int
 from lagjax._interface import RESULTS, Layout, advice, is_concrete, name_of, show_str
 from lagjax._run import Members
 from lagjax._scene import System
-from lagjax._trust._diagnosis import diagnosis, motion_end
+from lagjax._trust._diagnosis import diagnose, motion_end
 from lagjax._trust.health._border_counts import BorderCounts, count_borders, is_piecewise
 from lagjax._trust.health._global_error import global_error
 from lagjax._trust.health._measurements import SLACK, SMALLEST, VISIBLE, Extreme, does_work, measure_trajectory
@@ -87,7 +87,7 @@ def _first_diagnosis(trajectory) -> str:
     which = tuple(failed[0].tolist())
     layout, row = members.layout, int(np.ravel_multi_index(which, members.batch)) if which else 0
     ended = motion_end(trajectory, layout, which, members.numbers_of(row).astype(layout.dtype))
-    return diagnosis(trajectory.system, layout, members.params_of(row), ended).strip()
+    return diagnose(trajectory.system, layout, members.params_of(row), ended).strip()
 
 
 def _shared_impacts(trajectory) -> tuple:
