@@ -459,10 +459,8 @@ def _stroboscopic_points(scene, over, start: tuple, value: Callable | None, tran
     axes = axes_of(over)
     if len(axes) != 1:
         raise ValueError(f"over must have one axis; got {join_names([axis.dimension for axis in axes])}.")
-    names, times = (
-        axes[0].names,
-        1 + _require_count(transient, "transient", 0) + np.arange(_require_count(points, "points")),
-    )
+    names, count = axes[0].names, _require_count(points, "points")
+    times = 1 + _require_count(transient, "transient", 0) + np.arange(count)
     if start[0] is None:
         raise ValueError("strobe is the period of the drive, 2π/ω: give it, or a function of the point.")
     if not any(map(callable, start)) and not (isinstance(start[3], dict) and {*names} & {*start[3]}):
@@ -718,9 +716,7 @@ def _require_count(count, name: str, least: int = 1) -> int:
     return int(count)
 
 
-def _member_curves(
-    trajectory: Trajectory, members: int
-) -> tuple[Layout, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
+def _member_curves(trajectory: Trajectory, members: int) -> tuple[Layout, list[tuple[np.ndarray, ...]]]:
     """The curves (t, q, q̇) of at most this many members, evenly chosen, and the layout of their coordinates."""
     _require_numbers(trajectory, "trajectory")
     chosen = even_places(max(1, np.size(trajectory.ok)), _require_count(members, "members"))

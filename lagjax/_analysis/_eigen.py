@@ -125,14 +125,15 @@ def _decompose(matrix: Array) -> tuple[Array, Array, Array]:
     """Return s, X and X⁻¹."""
     n, dtype = len(matrix), jnp.result_type(matrix, jnp.complex64)
     shapes = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in ((n,), (n, n), (n, n)))
-    return _call_numpy(lambda a: _map_finite(_general_modes_of, a), shapes, matrix)  # pyright: ignore[reportReturnType]
+    return _call_numpy(lambda a: _map_finite(_eigendecompose, a), shapes, matrix)  # pyright: ignore[reportReturnType]
 
 
 # A basis of eigenvectors that has lost half of the digits is none: rounding splits a Jordan block of two by √eps.
 _WORST_BASIS = 1e7
 
 
-def _general_modes_of(matrix: np.ndarray) -> list[np.ndarray]:
+def _eigendecompose(matrix: np.ndarray) -> list[np.ndarray]:
+    """Return s (n,), X (n, n) and X⁻¹ of one matrix, as `_decompose`."""
     values, vectors = np.linalg.eig(matrix)
     order = _eigenvalue_order(values)
     values, vectors = values[order].astype(complex), vectors[:, order].astype(complex)

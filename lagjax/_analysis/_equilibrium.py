@@ -69,13 +69,7 @@ class Equilibrium(NamedTuple):
 
 @accepts_singles(("q", "qdot"), ("params",))
 def equilibrium(
-    system: System,
-    q: PyTree,
-    params: PyTree = None,
-    *,
-    qdot: PyTree = None,
-    stable: bool = False,
-    throw: bool = True,
+    system: System, q: PyTree, params: PyTree = None, *, qdot: PyTree = None, stable: bool = False, throw: bool = True
 ) -> Equilibrium:
     r"""The equilibrium of `system` that Newton's method reaches from `q`.
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from lagjax._analysis._gauge import changes_of, gauge_holds, gauge_of
+from lagjax._analysis._gauge import changes_of, gauge_of, verify_gauge
 from lagjax._analysis._noether import FlatState, charge_at, euler_lagrange, flat_generator, variation
 from lagjax._analysis._potential import absorb_potential_forces
 from lagjax._analysis._random_states import perturb_last_digits, random_states
@@ -238,7 +238,7 @@ def _symmetry_columns(fields: Fields, states: FlatState, *arguments) -> tuple[Ar
 
     def expressions_at(state):
         def expression(weights):
-            transform = fields.transform(weights, scene.params)
+            transform = fields.combine(weights, scene.params)
             rate, by_q = euler_lagrange(lambda *y: variation(scene, transform, *y), state)
             return rate - by_q, _work_and_drift(scene, transform, state)
 
@@ -305,7 +305,7 @@ def _restore_units(weights: np.ndarray, fields: Fields) -> tuple:
     """Convert weights (K,) to the user's units: α, b (n,), c (n,), A (n, n), β, and those of the user's generators."""
     alpha, b, c, of_maps, beta, own = fields.split_weights(weights)
     shift, drift = b * fields.scale, c * fields.scale / fields.time
-    return alpha * fields.time, shift, drift, np.tensordot(of_maps, fields.maps, 1), beta, own
+    return alpha * fields.time, shift, drift, np.tensordot(of_maps, fields.matrices, 1), beta, own
 
 
 def _describe_combination(weights: np.ndarray, fields: Fields, names: tuple[str, ...]) -> str:
@@ -344,7 +344,7 @@ def _conserved_quantities(
     changes, states = changes_of(scene, fields, weights, states)
     for k in _select_independent_charges(names, changes.gradients):
         gauge = gauge_of(scene, fields, weights[k], k, changes)
-        if gauge is None or gauge_holds(gauge, scene, fields, k, changes, states):
+        if gauge is None or verify_gauge(gauge, scene, fields, k, changes, states):
             quantities.append(Conserved(names[k], _noether_charge(scene, fields, weights[k], gauge), gauge))
         else:
             notes.append(f"not given: {names[k]}, by a symmetry whose gauge term could not be integrated")
@@ -382,7 +382,7 @@ def _noether_charge(scene: SceneState, fields: Fields, weights: np.ndarray, gaug
     def charge(q, qdot, t=0.0, params=None):
         numbers = eqx.filter(params, eqx.is_array_like)
         state = layout.flatten(q), layout.flatten(qdot), jnp.asarray(t, layout.dtype), numbers
-        transform = fields.transform(jnp.asarray(weights, layout.dtype), params)
+        transform = fields.combine(jnp.asarray(weights, layout.dtype), params)
         value = charge_at(system._motion(layout, params), transform, *state)
         return value if gauge is None else value - gauge(q, t, params)
 

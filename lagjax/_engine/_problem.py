@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.extend import core
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from lagjax._equations import Derivation, derivation_of
 from lagjax._interface import (
@@ -45,7 +45,6 @@ from lagjax._interface.reads import Edition
 from lagjax._native import ATOL_OVER_MOTION, ATOL_OVER_RTOL
 from lagjax._primitives import DOUBLE, SINGLE, compute_in_doubles
 
-PyTree = Any
 Numbers = Array | np.ndarray
 
 # The default, also for a state in float32, for which machine code computes in float64: 1e-7 would leave roundings alone
@@ -139,7 +138,7 @@ class Problem:
         return derivation_of(self.system, self.layout, self.params).with_numbers(self.vector)
 
     @functools.cached_property
-    def made(self) -> dict:
+    def engine_parts(self) -> dict:
         """The parts that engines have made of it, by name, and use more than once."""
         return {}
 
@@ -269,7 +268,7 @@ class Batch(eqx.Module):
         return len(self.ts) == 1
 
     @property
-    def whole(self) -> Problem:
+    def with_all_times(self) -> Problem:
         """The problem of one member with the times of all, as a trajectory of the batch has them."""
         return self.member if self.shares_times else replace(self.member, ts=self.ts)
 

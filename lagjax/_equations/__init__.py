@@ -14,14 +14,7 @@ function that are not finite or piecewise, with their source line.
 
 from lagjax._equations import _form as forms
 from lagjax._equations._accelerations import Accelerations
-from lagjax._equations._blame import (
-    describe_decisions,
-    find_motion_sides,
-    find_offenders,
-    find_poles,
-    find_sides,
-    list_motion_decisions,
-)
+from lagjax._equations._blame import describe_decisions, find_offenders, find_poles, find_sides, list_decisions
 from lagjax._equations._consistency import has_constraints, inconsistent_members, require_consistent
 from lagjax._equations._constraints import ROUNDINGS, Constraints, distances, is_inconsistent
 from lagjax._equations._coupled_forces import CoupledForces, couple_forces

@@ -23,6 +23,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._fit.model._assembly import GivenSystem, assemble_residuals, read_systems
 from lagjax._fit.model._law_parameters import AbstractLaw, LawParameters, find_laws, terms
@@ -52,7 +53,6 @@ from lagjax._primitives import with_doubles
 from lagjax._run.hybrid import Scene, may_jump
 from lagjax._scene import HOLDS
 
-PyTree = Any
 _METHODS = ("auto", "segments", "whole", "gradient")
 # Free numbers from which on a sentence says that another method may be meant. A trial of 288 numbers and 20 records of
 # 241 samples takes 1.8 s; of a network of 337 it took half a minute, and the gradient's whole descent as long.

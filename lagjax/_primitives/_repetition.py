@@ -102,10 +102,8 @@ class Repetition:
         written = [np.zeros((members, length, *shape)) for shape in of_round]
         sums = [np.zeros((members, *shape)) for shape in self.sums]
         for i, some in _round_members(count, members):
-            before = _select_members(carry, some)
-            found = go(
-                *_select_members(x, some), *before, *_select_members(still, some), *_select_members(rows, some, i)
-            )
+            before = _pick(carry, some)
+            found = go(*_pick(x, some), *before, *_pick(still, some), *_pick(rows, some, i))
             behind, new, parts = self.split_results(found)
             for arrays, values in ((written, before if keeps else new), (carry, behind)):
                 for kept, a in zip(arrays, values, strict=True):
@@ -123,18 +121,8 @@ class Repetition:
         x_ct = [np.zeros((members, *a.shape[1:])) for a in x]
         carry_ct = [np.repeat(ct, members // len(ct), axis=0) for ct in last]
         for i, some in reversed(_round_members(count, members)):
-            given = (
-                *_select_members(x, some),
-                *_select_members(before, some, i),
-                *_select_members(still, some),
-                *_select_members(rows, some, i),
-            )
-            found = go(
-                *given,
-                *_select_members(carry_ct, some),
-                *_select_members(written, some, i),
-                *_select_members(sums, some),
-            )
+            given = (*_pick(x, some), *_pick(before, some, i), *_pick(still, some), *_pick(rows, some, i))
+            found = go(*given, *_pick(carry_ct, some), *_pick(written, some, i), *_pick(sums, some))
             more, behind = _split(found, self.inputs)
             for total, a in zip(x_ct, more, strict=True):
                 total[some] += a
@@ -150,7 +138,7 @@ def _round_members(count, members: int) -> list[tuple]:
     return [(i, slice(None) if (i < count).all() else np.flatnonzero(i < count)) for i in of_all]
 
 
-def _select_members(arrays, some, i=slice(None)) -> list:
+def _pick(arrays, some, i=slice(None)) -> list:
     """The arrays of some members, at round i if it is given; an array with one row is shared by all members."""
     return [x[some, i] if len(x) > 1 else x[:, i] for x in arrays] if isinstance(i, int) else [
         x[some] if len(x) > 1 else x for x in arrays

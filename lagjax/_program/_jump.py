@@ -265,9 +265,11 @@ class _JumpBuilder:
         program = borders.program
         self.jets, self.n, self.pieces = _Jets(directions), size, len(borders.decisions)
         self.member, self.over_steps = member, over_steps
-        self.chosen = self.pieces * (2 if borders.levels_move else 1)  # numbers that choose what is zero at the border
+        self.selectors = self.pieces * (
+            2 if borders.levels_move else 1
+        )  # numbers that choose what is zero at the border
         self.numbers = program.size - 2 * size - 1 - self.pieces
-        fixed, dtypes = self.pieces + self.chosen, program.dtypes[: self.moving]
+        fixed, dtypes = self.pieces + self.selectors, program.dtypes[: self.moving]
         line = eliminate_dead_code(program.line, program.line.outputs[:size])
         self.switch, self.kick = _switching_number(borders, program.size), None
         self.field, self.switches = (self._add_rows(line, dtypes, fixed) for line in (line, self.switch))
@@ -318,7 +320,7 @@ class _JumpBuilder:
 
     def _moving_rates(self, place: list[Jet], pieces: Sequence[int]) -> list[Jet]:
         """The time derivatives, as jets, of all moving inputs: q̇, q̈, 1 for the time, 0 for parameters."""
-        unused = [self.graph.number(0.0)] * self.chosen
+        unused = [self.graph.number(0.0)] * self.selectors
         none: Jet = [None] * self.jets.rows
         one: Jet = [self.graph.number(1.0), *none[1:]]
         acceleration = self._jet_values(self.field, place, [*pieces, *unused])
@@ -371,7 +373,7 @@ class _JumpBuilder:
             for x, y in zip(place[: 2 * n], back[: 2 * n], strict=True):
                 results.append(zero if y[row] is None else graph.apply("sub", y[row], x[row]))
         line = eliminate_dead_code(graph, [*results, *a_before, *a_behind])
-        return Jump(line, self.jets.orders, self._lower_jets, 2 * self.pieces + self.chosen)
+        return Jump(line, self.jets.orders, self._lower_jets, 2 * self.pieces + self.selectors)
 
     def _jump_inputs(self) -> tuple[list[Jet], list[int], list[int], list[int]]:
         """The inputs in the order of `Jump`: jets of moving inputs, pieces before and behind, selecting numbers."""
@@ -383,7 +385,7 @@ class _JumpBuilder:
             return [self.graph.input(next(count), "float") for _ in range(size)]
 
         q, v, (t,), p = some(lower * n), some(lower * n), some(1), some(lower * numbers)
-        before, behind, hit = some(m), some(m), some(self.chosen)
+        before, behind, hit = some(m), some(m), some(self.selectors)
         q, v, p = q + some(upper * n), v + some(upper * n), p + some(upper * numbers)
         time: Jet = [t, *[None] * (rows - 1)]
         jets: list[Jet] = [[q[row * n + i] for row in range(self.jets.rows)] for i in range(n)]

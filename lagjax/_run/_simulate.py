@@ -276,12 +276,12 @@ def simulate_batch(
         )
         raise
     values = {name: as_arrays(value, batch.member.layout.dtype, name) for name, value in values.items()}
-    inconsistent = inconsistent_members(system, batch.member.layout, batch.whole.ts, values, axes)
+    inconsistent = inconsistent_members(system, batch.member.layout, batch.with_all_times.ts, values, axes)
     of_params = values["params"], batch_axes[2]
     if engine is None:
         trajectory = simulate_contact_batch(given, batch, max_transitions, *of_params)
     else:
-        trajectory = trajectory_of(given.whole, engine, engine.solve_batch(batch), given.y0, *of_params)
+        trajectory = trajectory_of(given.with_all_times, engine, engine.solve_batch(batch), given.y0, *of_params)
     return trajectory if inconsistent is None else _mask_inconsistent(trajectory, inconsistent)
 
 

@@ -110,7 +110,7 @@ class _SceneSource:
         of, n = self.derivation, self.n
         lines = {
             "acceleration": (
-                _nan_where_singular(of.accelerations.program.complete.line),
+                _mask_singular(of.accelerations.program.complete.line),
                 f"qddot[{n}]; NaN where M is singular",
             ),
             "mass_matrix": (of.program("mass_matrix").line, f"M, {n} rows of {n}"),
@@ -144,7 +144,7 @@ class _SceneSource:
         return self.numbers.form(_STEP.format(**settings, project=project).replace("double", self.numbers.type))
 
 
-def _nan_where_singular(line: StraightLine) -> StraightLine:
+def _mask_singular(line: StraightLine) -> StraightLine:
     """Return accelerations that are NaN where the line's last output, the singularity indicator, is positive."""
     graph = Graph.from_line(line, 2 * len(line.nodes) + 10)
     *values, singular = line.outputs

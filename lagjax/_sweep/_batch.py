@@ -69,9 +69,9 @@ class Batches:
             )
         if callable(roles["ts"]) and not callable(roles["q0"]):
             roles["q0"] = lambda _: description.q0  # each member has a start, as it has times
-        self._starts = {role: self._map_start(role, f) if callable(f) else None for role, f in roles.items()}
+        self._starts = {role: self._vectorize_start(role, f) if callable(f) else None for role, f in roles.items()}
         self._axes = tuple(0 if self._starts[role] else None for role in ("q0", "qdot0", "params"))
-        self._keep_all, self._keep_one = jax.jit(self._keep_vectorized), jax.jit(self._keep_member)
+        self._keep_all, self._keep_one = jax.jit(self._keep_members), jax.jit(self._keep_member)
         self._drift_all, self._tolerances = jax.jit(jax.vmap(self._energy_drift, in_axes=(0, self._axes[2]))), None
         self._settings = None
 
@@ -95,10 +95,10 @@ class Batches:
         """The bytes that are kept of a member, of the first of these; 0 where `keep` fails for that one."""
         motions, *_ = self._compute_motions({name: x[:1] for name, x in points.items()})
         try:
-            kept, _ = jax.eval_shape(self._keep_vectorized, motions.arrays, motions.params)
+            kept, _ = jax.eval_shape(self._keep_members, motions.arrays, motions.params)
             return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(kept))
         except NOT_TRACEABLE:
-            (row,), _ = self._member_rows(motions)
+            (row,), _ = self._call_keep(motions)
             return sum(x.nbytes for x in (row or {}).values())
 
     def _compute_motions(self, points: dict[str, np.ndarray]) -> tuple["_BatchMotions", dict[int, str], dict[int, str]]:
@@ -134,7 +134,7 @@ class Batches:
 
     # ---- compiled for all members ----
 
-    def _map_start(self, role: str, function: Callable) -> Callable:
+    def _vectorize_start(self, role: str, function: Callable) -> Callable:
         """`function(point)` for points (B,) of all members; why it raised for some is added to `complaints`."""
         compiled = jax.jit(jax.vmap(function))
 
@@ -148,18 +148,18 @@ class Batches:
 
         return start
 
-    def _keep_vectorized(self, arrays: tuple, params: PyTree) -> tuple:
+    def _keep_members(self, arrays: tuple, params: PyTree) -> tuple:
         keep_member = lambda *of: (self._keep_member(*of), self._energy_drift(*of))  # noqa: E731
         return jax.vmap(keep_member, in_axes=(0, self._axes[2]))(arrays, params)
 
     def _keep_member(self, arrays: tuple, params: PyTree) -> dict:
         run, crossings = arrays
         extras = {} if self.description.sections is None else {"crossings": crossings}
-        kept = self.description.keep(self._simulate_members(run, params), **extras)
+        kept = self.description.keep(self._member_trajectory(run, params), **extras)
         _require_dict(kept)
         return kept
 
-    def _simulate_members(self, arrays: dict, params: PyTree) -> Trajectory:
+    def _member_trajectory(self, arrays: dict, params: PyTree) -> Trajectory:
         scene, code, ts = self.description.system, arrays["code"], arrays.get("ts", self.description.ts)
         modes = dict(scene.modes) if isinstance(scene, Hybrid) else None
         return Trajectory.from_fields(
@@ -172,7 +172,7 @@ class Batches:
 
     def _energy_drift(self, arrays: tuple, params: PyTree):
         """|h − h₀| of a member from the first output to the end."""
-        scene, run = self.description.system, self._simulate_members(arrays[0], params)
+        scene, run = self.description.system, self._member_trajectory(arrays[0], params)
         if not self.conserves or isinstance(scene, Hybrid) or may_jump(scene):
             return None
         q, qdot = jax.tree.map(lambda x: x[0], (run.q, run.qdot))
@@ -183,7 +183,7 @@ class Batches:
 
     def _keep_one_by_one(self, motions: "_BatchMotions") -> tuple[dict[str, np.ndarray], dict[int, str]]:
         """The result of `keep` for each member, one after the other; and the complaints about these results."""
-        rows, errors = self._member_rows(motions)
+        rows, errors = self._call_keep(motions)
         if not self.quantities and not any(rows):
             raise errors[0]  # at the first look, of all members
         complaints = {k: f"keep raised {_describe_error(error)}" for k, error in errors.items()}
@@ -197,7 +197,7 @@ class Batches:
                 kept[name][k] = x
         return kept, complaints
 
-    def _member_rows(self, motions: "_BatchMotions") -> tuple[list[dict[str, np.ndarray] | None], dict[int, Exception]]:
+    def _call_keep(self, motions: "_BatchMotions") -> tuple[list[dict[str, np.ndarray] | None], dict[int, Exception]]:
         of_all = jax.tree.map(np.asarray, (*motions.arrays, motions.params))
         keep_member = self._keep_member if "keep" in self.slow else self._keep_one
 

@@ -88,7 +88,7 @@ def create_store(
     with store.create_aside() as new:
         new.create(spec, scene, axes, f"lagjax sweep over {', '.join(names)}", codes)
         if later is not None:
-            later.copy(new)
+            later.copy_starts(new)
         elif other is not None:
             copy_members(other, new)
 

@@ -121,7 +121,7 @@ class LaterEnd(NamedTuple):
             x[result != SUCCESSFUL] = np.nan
         return dict(zip(names[:-1], states, strict=True)), result
 
-    def copy(self, new: Files) -> None:
+    def copy_starts(self, new: Files) -> None:
         """Write the states as starts of the members of a new store; members that ended keep their result."""
         grid = new.grid(new.spec())
         for unit in range(grid.units):

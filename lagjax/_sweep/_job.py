@@ -150,7 +150,7 @@ class Unit(NamedTuple):
 
 def split_unit(job: Job, unit: int) -> list[tuple[np.ndarray, int]]:
     """Return the batches of a unit: the members in each, all of one length, and how many are not copies."""
-    members = np.setdiff1d(np.arange(job.grid.size(unit)), job.store.copied(unit).members)
+    members = np.setdiff1d(np.arange(job.grid.size(unit)), job.store.read_copied(unit).members)
     if not members.size:
         return []
     batch = math.ceil(len(members) / math.ceil(len(members) / job.spec["batch"]))
@@ -161,13 +161,13 @@ def split_unit(job: Job, unit: int) -> list[tuple[np.ndarray, int]]:
 
 def unit_points(job: Job, unit: int) -> Callable[[np.ndarray], dict[str, np.ndarray]]:
     axes, shape = job.store.coordinates(job.spec["axes"], job.grid.box(unit)), job.grid.box_shape(unit)
-    starts = job.store.copied(unit).starts
+    starts = job.store.read_copied(unit).starts
     return lambda which: points_of(axes, shape, which) | {name: x[which] for name, x in starts.items()}
 
 
 def compute_unit(job: Job, unit: int) -> Unit:
     began, spent = time.monotonic(), time.process_time()
-    size, points, copied = job.grid.size(unit), unit_points(job, unit), job.store.copied(unit)
+    size, points, copied = job.grid.size(unit), unit_points(job, unit), job.store.read_copied(unit)
     drifts, complaints = np.full(size, np.nan), {}
     values = {q.name: np.full((size, *q.shape), q.filling, q.dtype) for q in (*job.batches.quantities, RESULT)}
     result = values[RESULT.name]

@@ -47,7 +47,7 @@ def units_to_compute(job: Job, part: slice) -> list[int]:
     finished = {unit for unit in store.finished_units() if unit in chosen or unit >= job.grid.units}
     damaged = store.find_damage(job.spec, finished, whole=True)
     for unit in damaged:
-        store.undo(job.spec, unit)
+        store.mark_undone(job.spec, unit)
     if damaged:
         first = "; ".join(list(damaged.values())[:_NAMED])
         more = f"; and {len(damaged) - _NAMED} units more" if len(damaged) > _NAMED else ""

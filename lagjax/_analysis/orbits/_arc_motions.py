@@ -61,7 +61,7 @@ class Units(NamedTuple):
     def repeat(self, count: int) -> "Units":
         return Units(*(np.repeat(x, count, axis=0) for x in self))
 
-    def growth(self, growth: np.ndarray) -> np.ndarray:
+    def scale_growth(self, growth: np.ndarray) -> np.ndarray:
         """Convert derivatives of states by states, (R, …, 2n, 2n), to these units."""
         state = self.state.reshape(len(self.state), *[1] * (growth.ndim - 3), -1)
         return growth * state[..., None, :] / state[..., :, None]
@@ -112,13 +112,13 @@ class Arcs:
         other.numbers = numbers
         return other
 
-    def ends(self, times: np.ndarray, y0: np.ndarray):
+    def integrate(self, times: np.ndarray, y0: np.ndarray):
         """Integrate without derivatives, `times` (R, T) or (1, T) and `y0` (R, 2n): a `Solution` or `JumpRun`."""
         if self.jumping is not None:
             return self.jumping.run(times, y0)
         return self.flow.run(times, y0, self.numbers[None], self.tolerances)
 
-    def equal_shares(self, span: np.ndarray, y0: np.ndarray, count: int) -> np.ndarray:
+    def divide_evenly(self, span: np.ndarray, y0: np.ndarray, count: int) -> np.ndarray:
         """Divide spans (R,) into `count` parts with about equally many steps each: fractions (R, count + 1).
 
         A part begins where the state is small and changes slowly, if there is such a time nearby.
@@ -126,7 +126,7 @@ class Arcs:
         shares = np.tile(np.arange(count + 1) / count, (len(y0), 1))
         times = np.stack([np.zeros_like(span), span], axis=1)
         room = min(_BUDGET * len(y0), _MOST_WRITTEN // (y0.shape[1] + 4))
-        run, found = self.flow.follow(times, y0, self.numbers[None], self.tolerances, room)
+        run, found = self.flow.run_and_record(times, y0, self.numbers[None], self.tolerances, room)
         for row, table in (member for steps in found for member in steps.split_members()):
             if run.result[row] == SUCCESSFUL and len(table) >= 4 * count:
                 begins, lengths = table[:, :2].T / span[row]
@@ -135,7 +135,7 @@ class Arcs:
                 shares[row, 1:-1] = [begins[some[np.argmax(lengths[some])]] for some in around]
         return shares
 
-    def follow(self, times: np.ndarray, y0: np.ndarray, directions: np.ndarray | None = None, modes=None) -> Arc:
+    def differentiate(self, times: np.ndarray, y0: np.ndarray, directions: np.ndarray | None = None, modes=None) -> Arc:
         """Integrate from `y0` (R, 2n), in `modes` (R,), over `times` (R, 2), with derivatives: an `Arc`."""
         rows, states = y0.shape
         if self.jumping is not None:
@@ -152,7 +152,7 @@ class Arcs:
         well = run.result == SUCCESSFUL
         moved = np.full(dy0.shape, np.nan)
         if well.any():
-            motions = Motions.from_solution(times, y0, params, run).take(np.flatnonzero(well))
+            motions = Motions.from_solution(times, y0, params, run).select_members(np.flatnonzero(well))
             moved[well] = jvp(self.flow, motions, dy0[well], dparams[well], self.tolerances)[1]
         end = np.where(well[:, None], run.y_end, np.nan)
         by_start, by_params = np.split(np.swapaxes(moved, 1, 2), [states], axis=2)
@@ -204,7 +204,7 @@ class Arcs:
         of = self.sample(t, y).quantities("energy_by_q", "mass_matrix")
         return np.concatenate([of["energy_by_q"], np.einsum("rij,rj->ri", of["mass_matrix"], halves(y)[1])], axis=1)
 
-    def canonical(self, t, y: np.ndarray, units: Units) -> np.ndarray:
+    def canonical_charts(self, t, y: np.ndarray, units: Units) -> np.ndarray:
         """Return ∂(q, p)/∂(q, q̇), (R, 2n, 2n), with q and q̇ in `units`, in which the symplectic form is standard.
 
         The unit of pᵢ is such that its product with that of qᵢ is the same for all i.
@@ -217,7 +217,7 @@ class Arcs:
         of_p = (units.length**2 / units.time)[:, None] / of_q
         return chart * units.state[:, None, :] / np.concatenate([of_q, of_p], axis=1)[:, :, None]
 
-    def why_not(self, row: int, arc: Arc, y0: np.ndarray, t_last: float) -> str:
+    def explain_failure(self, row: int, arc: Arc, y0: np.ndarray, t_last: float) -> str:
         if not np.broadcast_to(arc.returns, arc.result.shape)[row]:
             return "It ends in another mode: give a period in which it comes back to the one it began in."
         if arc.result[row] == SUCCESSFUL:

@@ -32,7 +32,7 @@ class Condensed(NamedTuple):
     more: np.ndarray
     rounds: tuple[EliminationRound, ...]
 
-    def inner(self, x: np.ndarray, end: np.ndarray, z: np.ndarray) -> np.ndarray:
+    def expand_solution(self, x: np.ndarray, end: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Return all unknowns (B, K, s, m) from those at the ends, x_0 and x_K (B, s, m), and z (B, c, m)."""
         known = np.stack([x, end], axis=1)
         for of in reversed(self.rounds):

@@ -97,12 +97,12 @@ class Follower:
         self.of_value = 1.0
         self.period_is_free = not arcs.driven and (place is None or not arcs.conserves)
 
-    def closing(self, numbers: np.ndarray) -> Closing:
-        return Closing.plain(self.arcs.with_numbers(numbers))
+    def closing_conditions(self, numbers: np.ndarray) -> Closing:
+        return Closing.without_image(self.arcs.with_numbers(numbers))
 
-    def point(self, y, period, parts, numbers) -> FamilyPoint:
+    def orbit_point(self, y, period, parts, numbers) -> FamilyPoint:
         """Return the chain through these states, (1, K, 2n), and its closing equations."""
-        closing = self.closing(numbers)
+        closing = self.closing_conditions(numbers)
         chain = _shooting.integrate_chain(closing, y, period, parts, self.units)
         columns = [chain.rate[..., None] * np.diff(chain.parts)[..., None, None]] if self.period_is_free else []
         if self.place is not None:
@@ -122,26 +122,26 @@ class Follower:
         times = np.stack([spans[:-1], spans[1:]], axis=1)
         if not self.arcs.driven:
             times[:, 1] = whole * np.diff(parts[0])
-        by_params = closing.arcs.follow(times, y[0] * state, direction).by_params
+        by_params = closing.arcs.differentiate(times, y[0] * state, direction).by_params
         return by_params[None] * self.of_parameter / state[:, None]
 
     def complete_change(self, point: FamilyPoint, first: np.ndarray, right: float) -> "FamilyUnknowns":
         """Return the change of all numbers that follows linearly from a change `first` (2n + F,) of the unknowns."""
         states = point.chain.y.shape[2]
         z = np.append(first[states:], right)[None, :, None]
-        dy = point.condensed.inner(first[None, :states, None], first[None, :states, None], z)[..., 0]
+        dy = point.condensed.expand_solution(first[None, :states, None], first[None, :states, None], z)[..., 0]
         by = np.zeros(len(point.numbers))
         if self.place is not None:
             by[self.place] = self.of_parameter * first[-1]
         return FamilyUnknowns(dy, first[states : states + 1] if self.period_is_free else np.zeros(1), by)
 
-    def move(self, point: FamilyPoint, first: np.ndarray, right: float) -> FamilyPoint:
+    def apply_change(self, point: FamilyPoint, first: np.ndarray, right: float) -> FamilyPoint:
         """Return the point after a change (2n + F,) of its unknowns; states of inner arcs change with them."""
-        return self.rebuild(point, jax.tree.map(np.add, point.unknowns, self.complete_change(point, first, right)))
+        return self.build_point(point, jax.tree.map(np.add, point.unknowns, self.complete_change(point, first, right)))
 
-    def rebuild(self, point: FamilyPoint, whole: "FamilyUnknowns") -> FamilyPoint:
+    def build_point(self, point: FamilyPoint, whole: "FamilyUnknowns") -> FamilyPoint:
         """Return the point with the numbers `whole`, its arcs at the same fractions of the period as `point`."""
-        return self.point(whole.y, whole.period, point.chain.parts, whole.numbers)
+        return self.orbit_point(whole.y, whole.period, point.chain.parts, whole.numbers)
 
     def refine_arcs(self, point: FamilyPoint) -> FamilyPoint:
         """Divide the orbit into more arcs if errors grow much along one arc; else return the point itself."""
@@ -154,10 +154,10 @@ class Follower:
 
     def divide_orbit(self, y0: np.ndarray, period: np.ndarray, count: int, numbers: np.ndarray) -> FamilyPoint:
         """Divide the orbit from a state (1, 2n) with a period (1,), both in the user's units, into `count` arcs."""
-        parts, y = _shooting.guess_states(self.closing(numbers), y0, period, count)
-        return self.point(y / self.units.state[:, None], period / self.units.time, parts, numbers)
+        parts, y = _shooting.guess_states(self.closing_conditions(numbers), y0, period, count)
+        return self.orbit_point(y / self.units.state[:, None], period / self.units.time, parts, numbers)
 
-    def slope(self, point: FamilyPoint) -> np.ndarray:
+    def ascent(self, point: FamilyPoint) -> np.ndarray:
         """Return the unit vector (2n + F,) along which the value increases."""
         slope = np.zeros(point.matrix.shape[1])
         if self.place is not None:
@@ -186,7 +186,7 @@ def tangent_at(
     """
     states = point.matrix.shape[0]
     whole, still = decide(point.matrix, _shooting.RANK), decide(point.matrix[:, :states], _shooting.RANK)
-    slope, count, rank = follower.slope(point), states - int(still.rank), int(whole.rank)
+    slope, count, rank = follower.ascent(point), states - int(still.rank), int(whole.rank)
     if before is not None:  # a rank that falls short of itself in passing a branch point
         at_least = whole.values[before.rank - 1] > _ROUNDING * whole.values[0]
         rank = max(rank, before.rank) if at_least else rank
@@ -230,13 +230,13 @@ def correct_orbit(
         matrix, right = np.concatenate([point.matrix, across.vector[None]]), np.append(point.right, 0.0)
         change = -decide(matrix)._replace(rank=np.array(across.rank + 1 - left_out)).least_norm(right)
         sizes.append(np.linalg.norm(change))
-        point = follower.move(point, change, 1.0)
+        point = follower.apply_change(point, change, 1.0)
     return (point, np.array(sizes)) if point.closed(CLOSED) else None
 
 
 def step_along(follower: Follower, last: FamilyPoint, tangent: FamilyTangent, step: float) -> FamilyStep | None:
     """Return the orbit one step further; None if the step was too long for the family."""
-    there = correct_orbit(follower, follower.move(last, step * tangent.vector, 0.0), tangent)
+    there = correct_orbit(follower, follower.apply_change(last, step * tangent.vector, 0.0), tangent)
     if there is None:
         return None
     point, sizes = there

@@ -157,11 +157,11 @@ def _build_member(follower: Follower, point: FamilyPoint, tangent: FamilyTangent
     """Return an orbit with its multipliers; at most `most` directions count as symmetries."""
     (symmetries,) = _shooting.find_null_spaces(point.chain, most)
     count = symmetries.null.shape[2]
-    found = assess_orbits(follower.closing(point.numbers), point.chain, count)
+    found = assess_orbits(follower.closing_conditions(point.numbers), point.chain, count)
     reduced = reduce_arcs(point.chain.growth[0], *symmetries)
     through = [passage_determinant(reduced, sign) if not found.message[0] else np.nan for sign in (1, -1)]
     beyond = np.nan if follower.until is None else (follower.value(point) - follower.until) / follower.of_value
-    return _Member(point, tangent, count, found, np.array([follower.slope(point) @ tangent.vector, *through, beyond]))
+    return _Member(point, tangent, count, found, np.array([follower.ascent(point) @ tangent.vector, *through, beyond]))
 
 
 def _follow_family(follower: Follower, y0, period, step: float, count: int) -> tuple[list[_Member], str]:
@@ -284,7 +284,7 @@ def _orbit_between(
     along = ((found[x].point, found[x].tangent.vector) for x in (a, b))
     slopes = (follower.complete_change(point, vector / (vector @ across.vector), 0.0) for point, vector in along)
     guess = jax.tree.map(lambda *parts: sum(map(operator.mul, shares, parts)), *ends, *slopes)
-    there = correct_orbit(follower, follower.rebuild(found[a].point, guess), across, left_out)
+    there = correct_orbit(follower, follower.build_point(found[a].point, guess), across, left_out)
     tangent = None if there is None else tangent_at(follower, there[0], found[a].tangent, left_out)
     if there is None or tangent is None or tangent.vector @ across.vector < _ALONG:
         return None
@@ -359,7 +359,7 @@ def branch_off(
             f"No orbit of another family was found {size:.3g} from orbit {index}: try another size, or follow the "
             "family again with another first step, so that its neighbours lie elsewhere."
         )
-    found = assess_orbits(follower.closing(point.numbers), point.chain, before.symmetries.shape[1])
+    found = assess_orbits(follower.closing_conditions(point.numbers), point.chain, before.symmetries.shape[1])
     return restore_orbits(follower.arcs.layout, FlatOrbits(*(x[0] for x in found)), found.message[0])
 
 
@@ -385,5 +385,5 @@ def _branching_orbit(follower: Follower, here: FamilyPoint, before: FamilyTangen
     if not directions.shape[1]:
         return None
     across = FamilyTangent(directions[:, 0], before.rank, before.symmetries)
-    there = correct_orbit(follower, follower.move(here, size * across.vector, 0.0), across)
+    there = correct_orbit(follower, follower.apply_change(here, size * across.vector, 0.0), across)
     return None if there is None else there[0]

@@ -157,7 +157,7 @@ def _closing_conditions(arcs: Arcs, energy, image) -> Closing:
         energy = float(energy)
         if not arcs.conserves:
             raise ValueError("energy=... asks for an energy, but that of this scene is not conserved: leave it out.")
-    plain = Closing.plain(arcs, energy)
+    plain = Closing.without_image(arcs, energy)
     if image is None:
         return plain
     layout, states = arcs.layout, 2 * arcs.size
@@ -217,7 +217,7 @@ def arc_counts(arcs: Arcs, y0, period) -> np.ndarray:
     """Return the number of arcs of each orbit, a power of two, from the number of steps of its guess."""
     if arcs.jumping:  # a state between does not tell the mode
         return np.ones(len(period), int)
-    run = arcs.ends(np.stack([np.zeros(len(period)), period], axis=1), y0)
+    run = arcs.integrate(np.stack([np.zeros(len(period)), period], axis=1), y0)
     share = np.where(run.result == SUCCESSFUL, 1.0, np.clip(run.t_end / period, 1e-3, 1.0))
     count = np.maximum(1.0, run.accepted / share / _STEPS_OF_ARC)
     return np.minimum(MOST_ARCS, 2 ** np.ceil(np.log2(count))).astype(int)

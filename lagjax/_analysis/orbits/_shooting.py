@@ -52,29 +52,29 @@ class Closing(NamedTuple):
     q_end: np.ndarray | None = None
 
     @classmethod
-    def plain(cls, arcs: Arcs, energy: float | None = None) -> "Closing":
+    def without_image(cls, arcs: Arcs, energy: float | None = None) -> "Closing":
         return cls(arcs, np.eye(2 * arcs.size), np.zeros(2 * arcs.size), energy)
 
     @property
-    def lasts(self) -> bool:
+    def has_given_duration(self) -> bool:
         """True if the duration is given: that of a path, and the period of a driven scene."""
         return self.arcs.driven or self.q_end is not None
 
-    def free(self) -> tuple[np.ndarray, np.ndarray]:
+    def free_directions(self) -> tuple[np.ndarray, np.ndarray]:
         """E and F (2n, 2n): the unknowns u (2n,) change the first state by E u and the last by F u."""
         whole, n = np.eye(2 * self.arcs.size), self.arcs.size
         if self.q_end is None:
             return whole, whole
         return np.roll(whole, n, axis=0) * (np.arange(2 * n) < n), whole * (np.arange(2 * n) >= n)
 
-    def target(self, y: np.ndarray, end: np.ndarray, of_state: np.ndarray) -> np.ndarray:
+    def arc_targets(self, y: np.ndarray, end: np.ndarray, of_state: np.ndarray) -> np.ndarray:
         """Return the states (B, K, 2n) where arcs from `y` that end at `end` should end, in units of (B, 2n)."""
         target, n = np.roll(y, -1, axis=1), self.arcs.size
         if self.q_end is not None:
             target[:, -1] = np.concatenate([self.q_end / of_state[:, :n], end[:, -1, n:]], axis=1)
         return target
 
-    def conditions(self, y0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def energy_condition(self, y0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the energy error of first states (B, 2n), (B, m), and its gradient (B, m, 2n); m is 0 or 1."""
         if self.energy is None:
             return np.zeros((len(y0), 0)), np.zeros((len(y0), 0, y0.shape[1]))
@@ -149,12 +149,12 @@ def guess_states(closing: Closing, y0: np.ndarray, period: np.ndarray, count: in
     if count == 1:
         return np.broadcast_to([0.0, 1.0], (len(y0), 2)), y0[:, None].copy()
     if arcs.driven:
-        parts = arcs.equal_shares(period, y0, count)
-        return parts, arcs.ends(period[:, None] * parts, y0).path[:, :count]
+        parts = arcs.divide_evenly(period, y0, count)
+        return parts, arcs.integrate(period[:, None] * parts, y0).path[:, :count]
     half, images = count // 2, y0 @ closing.matrix.T + closing.shift
-    ahead, back = arcs.equal_shares(period / 2, y0, half), arcs.equal_shares(-period / 2, images, half)
-    first = arcs.ends(period[:, None] / 2 * ahead, y0).path
-    second = arcs.ends(-period[:, None] / 2 * back, images).path
+    ahead, back = arcs.divide_evenly(period / 2, y0, half), arcs.divide_evenly(-period / 2, images, half)
+    first = arcs.integrate(period[:, None] / 2 * ahead, y0).path
+    second = arcs.integrate(-period[:, None] / 2 * back, images).path
     parts = np.concatenate([ahead / 2, 1 - back[:, -2::-1] / 2], axis=1)
     return parts, np.concatenate([first, second[:, -2:0:-1]], axis=1)
 
@@ -165,9 +165,9 @@ def integrate_chain(closing: Closing, y: np.ndarray, period: np.ndarray, parts: 
     of_state, spans = units.state[:, None], (period * units.time)[:, None]
     times = closing.t_first + np.stack([spans * parts[:, :-1], spans * parts[:, 1:]], axis=2).reshape(-1, 2)
     rows = (y * of_state).reshape(-1, states)
-    if not closing.lasts:  # each begins at zero, where times have the most digits
+    if not closing.has_given_duration:  # each begins at zero, where times have the most digits
         times = (spans * np.diff(parts)).reshape(-1, 1) * np.array([0.0, 1.0])
-    arc = arcs.follow(times, rows)
+    arc = arcs.differentiate(times, rows)
     rate = arc.rate.reshape(y.shape)
     ok = np.asarray((arc.ok & arc.returns).reshape(chains, count).all(axis=1))
     end, growth = arc.end.reshape(y.shape), arc.by_start.reshape(*y.shape, states)
@@ -175,20 +175,20 @@ def integrate_chain(closing: Closing, y: np.ndarray, period: np.ndarray, parts: 
     end[:, -1], rate[:, -1] = np.linalg.solve(closing.matrix, (end[:, -1] - closing.shift).T).T, rate[:, -1] @ inverse.T
     growth[:, -1] = inverse @ growth[:, -1]
     end = end / of_state
-    defect = end - closing.target(y, end, units.state)
-    off, slope = closing.conditions(y[:, 0] * units.state)
+    defect = end - closing.arc_targets(y, end, units.state)
+    off, slope = closing.energy_condition(y[:, 0] * units.state)
     rate, slope = rate * units.time[:, None, None] / of_state, slope * of_state
     why = np.full(chains, "", object)
     for k in np.flatnonzero(~ok).tolist():
         row = k * count + int(np.argmin((arc.ok & arc.returns)[k * count : (k + 1) * count]))
-        why[k] = arcs.why_not(row, arc, rows, times[row, 1])
-    return Chain(y, period, parts, units, defect, units.growth(growth), rate, off, slope, ok, why)
+        why[k] = arcs.explain_failure(row, arc, rows, times[row, 1])
+    return Chain(y, period, parts, units, defect, units.scale_growth(growth), rate, off, slope, ok, why)
 
 
 class NewtonEquations(NamedTuple):
     """Newton's equations of B chains, condensed to both ends, with the rank decided; `right` (B, 2n + m).
 
-    The unknowns are u (2n,) of `Closing.free`, and the period if it is free.
+    The unknowns are u (2n,) of `Closing.free_directions`, and the period if it is free.
     """
 
     condensed: Condensed
@@ -200,13 +200,13 @@ def condense_equations(closing: Closing, chain: Chain) -> NewtonEquations:
     condensed = condense_chain(
         chain.growth, np.stack([chain.rate * np.diff(chain.parts)[..., None], chain.defect], axis=3)
     )
-    of_first, of_last = closing.free()
+    of_first, of_last = closing.free_directions()
     regular, of_period = condensed.first @ of_first + condensed.last @ of_last, condensed.more[..., :1]
     # A condition in units of the state, as the defects are.
     unit = 1 / np.maximum(np.abs(chain.slope).max(axis=2), 1e-300)
     matrix = np.concatenate([regular, unit[:, :, None] * chain.slope], axis=1)
     right = np.concatenate([condensed.more[..., 1], unit * chain.off], axis=1)
-    if not closing.lasts:
+    if not closing.has_given_duration:
         none = np.zeros((len(matrix), chain.off.shape[1], 1))
         matrix = np.concatenate([matrix, np.concatenate([of_period, none], axis=1)], axis=2)
     if closing.q_end is None:
@@ -220,10 +220,10 @@ def newton_correction(closing: Closing, chain: Chain) -> tuple[np.ndarray, np.nd
     """Return the Newton step of least norm: dy (B, K, 2n), dT (B,); 0 if the ends of a path are conjugate."""
     condensed, decided, right = condense_equations(closing, chain)
     step, states = -decided.least_norm(right), chain.y.shape[2]
-    period = np.zeros(len(step)) if closing.lasts else step[:, -1]
-    first, last = (step[:, :states] @ of.T for of in closing.free())
+    period = np.zeros(len(step)) if closing.has_given_duration else step[:, -1]
+    first, last = (step[:, :states] @ of.T for of in closing.free_directions())
     z = np.stack([period, np.ones(len(step))], axis=1)[:, :, None]
-    dy = condensed.inner(first[..., None], last[..., None], z)[..., 0]
+    dy = condensed.expand_solution(first[..., None], last[..., None], z)[..., 0]
     if closing.q_end is not None:
         dy[decided.rank < states] = 0.0
     return dy, period
@@ -291,7 +291,7 @@ def _closure_null_vectors(growth: np.ndarray) -> tuple[Decided, np.ndarray]:
     chains, count, states, _ = growth.shape
     condensed = condense_chain(growth, np.zeros((chains, count, states, 0)))
     rank = decide(condensed.first + condensed.last, RANK)
-    return rank, condensed.inner(rank.right, rank.right, np.zeros((chains, 0, states)))
+    return rank, condensed.expand_solution(rank.right, rank.right, np.zeros((chains, 0, states)))
 
 
 def is_equilibrium(chain: Chain) -> np.ndarray:

@@ -164,7 +164,7 @@ class Diffrax(AbstractEngine, eqx.Module):
         steps = solution.accepted + solution.rejected
         return solution._replace(idle=steps.size * jnp.max(steps) - jnp.sum(steps))
 
-    def method(self, problem: Problem) -> Stepping:
+    def stepping(self, problem: Problem) -> Stepping:
         """The steps over this problem."""
         dtype, ts, solver = problem.layout.dtype, jnp.asarray(problem.ts), self.solver
         if solver is None:
@@ -226,7 +226,7 @@ def _solve_problem(engine: Diffrax, problem: Problem) -> Solution:
     start = _start_result(y0, *form.acceleration(*stop_derivatives((given[0], halves(y0), numbers))))
     ts = jnp.where(start == RESULTS.successful, given, given[0])
     event, is_located = (None, True) if problem.event is None else _flatten_event(problem, ts, y0, numbers)
-    method = engine.method(problem)
+    method = engine.stepping(problem)
     if form.constrained:  # a start that was typed, or is rounded to float32; the way to it is no error of a step
         y0 = jnp.concatenate(form.projected(given[0], halves(y0), numbers))
     solution = integrate(form, method, engine.adjoint, event, ts, y0, numbers)

@@ -12,13 +12,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax._equations import Derivation, Motion
 from lagjax._interface import compiled_once, halves
 from lagjax._tracing import Program
 
-PyTree = Any
 Vector = Float[Array, " n"]
 State = tuple[Vector, Vector]  # q and q̇
 Time = Float[Array, ""]

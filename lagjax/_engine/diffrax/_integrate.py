@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
+from jaxtyping import PyTree
 
 from lagjax._engine._problem import Solution
 from lagjax._engine.diffrax._equations import MotionEquations
@@ -34,8 +35,6 @@ from lagjax._engine.diffrax._jumps import (
 from lagjax._engine.diffrax._solvers import Projected
 from lagjax._interface import ENDED_WELL, RESULTS, SUCCESSFUL, code_of, halves
 from lagjax._primitives import differentiable_where, vary_alike
-
-PyTree = Any
 
 
 class Stepping(eqx.Module):
@@ -247,7 +246,7 @@ class _RecordedSteps(diffrax.AbstractStepSizeController):
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
         next_ = self.times.at[controller_state].get(mode="fill", fill_value=jnp.inf)
-        begin, jumps = (t1, False) if self.jumps is None else self.jumps.next_start(t1)
+        begin, jumps = (t1, False) if self.jumps is None else self.jumps.skip_jump(t1)
         return True, begin, next_, jumps, controller_state + 1, diffrax.RESULTS.successful
 
 
@@ -277,12 +276,12 @@ class JumpTimes(eqx.Module):
         low, high = jnp.minimum(one, other), jnp.maximum(one, other)
         return JumpTimes(*(jnp.sort(jnp.where(jnp.isfinite(x), x, jnp.inf)) for x in (low, high)))
 
-    def next_start(self, t):
+    def skip_jump(self, t):
         """The time at which the step after one that ended at t begins, and whether that is behind a jump."""
         begin = _exchange_times(t, self.before, self.behind)
         return begin, begin != t
 
-    def first(self, begin, end):
+    def limit_end(self, begin, end):
         """`end`, or the first jump on the way from `begin` to it."""
         ahead = jnp.searchsorted(self.before, begin, side="right")
         return jnp.minimum(end, self.before.at[ahead].get(mode="fill", fill_value=jnp.inf))
@@ -308,9 +307,9 @@ class WithJumps(AdaptiveWrapper):
 
     def init(self, terms, t0, *arguments):
         end, state = self.controller.init(terms, t0, *arguments)
-        return self.jumps.first(t0, end), state
+        return self.jumps.limit_end(t0, end), state
 
     def adapt_step_size(self, *arguments):
         keep, begin, end, made_jump, state, result = self.controller.adapt_step_size(*arguments)
-        behind, jumps = self.jumps.next_start(begin)
-        return keep, behind, self.jumps.first(behind, end + (behind - begin)), made_jump | jumps, state, result
+        behind, jumps = self.jumps.skip_jump(begin)
+        return keep, behind, self.jumps.limit_end(behind, end + (behind - begin)), made_jump | jumps, state, result

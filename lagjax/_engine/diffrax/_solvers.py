@@ -15,8 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-
-PyTree = Any
+from jaxtyping import PyTree
 
 
 class _SolverWrapper(diffrax.AbstractAdaptiveSolver):

@@ -21,9 +21,9 @@ from lagjax._engine._problem import AbstractEngine, Batch, Problem, Solution, so
 from lagjax._engine.taylor import _primitives
 from lagjax._engine.taylor._crossing import (
     FoundCrossings,
-    integrate_stretch,
     motion_to_event,
     motion_with_crossings,
+    run_stretch,
     surfaces_of,
     surfaces_of_event,
 )

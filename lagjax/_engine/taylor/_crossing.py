@@ -47,9 +47,9 @@ class FoundCrossings(NamedTuple):
 
 def surfaces_of_event(problem: Problem) -> Surfaces:
     """The functions of an event as surfaces. Raises `Unlowerable` if machine code cannot evaluate them."""
-    if "surfaces" not in problem.made:
-        problem.made["surfaces"] = _surfaces_of_event(problem)
-    return problem.made["surfaces"]
+    if "surfaces" not in problem.engine_parts:
+        problem.engine_parts["surfaces"] = _surfaces_of_event(problem)
+    return problem.engine_parts["surfaces"]
 
 
 def _surfaces_of_event(problem: Problem) -> Surfaces:
@@ -136,7 +136,7 @@ def _event_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
     return run_unguarded
 
 
-def integrate_stretch(
+def run_stretch(
     flow: Flow, surfaces: Surfaces | None, tolerances: Tolerances, ts, y0, params, t_end, y_end, k, crosses
 ) -> tuple:
     """The path, the end time, and the state there, of a motion from ts[0] to `t_end`; surface k `crosses` there.

@@ -499,7 +499,7 @@ def _go_back_on_gpu(motions: Motions, path_ct, end_ct, *, flow, tolerances):
     if has_passages(flow.kernel):
         return None
     members, m = end_ct.shape[:2]
-    ts, y0, params, *_ = motions.take(np.repeat(np.arange(members), m))
+    ts, y0, params, *_ = motions.select_members(np.repeat(np.arange(members), m))
     path_ct, end_ct = (x.reshape(members * m, *x.shape[2:]) for x in (path_ct, end_ct))
     go_back = functools.partial(transpose_on_gpu, flow, tolerances, ts, y0, params)
     try:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine import DEFAULT_RTOL
 from lagjax._equations import has_constraints
@@ -26,8 +27,6 @@ from lagjax._fit.model._timings import Timings, build_clock
 from lagjax._interface import Layout, find_params_expression
 from lagjax._primitives import DOUBLE
 from lagjax._run.hybrid import Scene, first_law, may_jump, require_scene
-
-PyTree = Any
 
 
 class GivenSystem(NamedTuple):

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._run.hybrid import Hybrid, Scene, Transition, list_laws
 from lagjax._scene import (
@@ -27,7 +28,6 @@ from lagjax._scene import (
     samples,
 )
 
-PyTree = Any
 _LEAST_ROOM, _GROWTH = 16, 4  # of tables: at most four times what is needed, and six programs up to 16 000 samples
 
 

@@ -35,8 +35,6 @@ from lagjax._run import simulate
 from lagjax._run.hybrid import Scene, first_law, may_jump
 from lagjax._scene import DrivenParams, System
 
-PyTree = Any
-
 
 class RecordMotion(NamedTuple):
     """N motions: `path` (N, T, 2n), `tangents` (N, D, T, 2n), and how each ended: `result`, `t_end` (N,), `y_end`."""

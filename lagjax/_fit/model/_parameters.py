@@ -17,12 +17,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._fit.model._law_parameters import find_laws, plain_dicts
 from lagjax._fit.model._transforms import AbstractTransform, Smooth, Unbounded
 from lagjax._interface import as_arrays, labelled_leaves, require_finite
-
-PyTree = Any
 
 
 class _PerRecord:

@@ -15,11 +15,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._fit.model._noise import find_step
 from lagjax._fit.model._records import Record, restore_structure, spread_over_signals
 
-PyTree = Any
 _CLEAR = 0.35  # of a period between neighbours: at a half the way round is ambiguous; noise takes the rest
 _UNCLEAR = 0.05  # share of steps that may be longer, over gaps and glitches: states are read well where most are not
 _SHARP = 3.0  # times the steps beside it that a jump is large: a tent of noise is 2, and a period of 6 samples is 5

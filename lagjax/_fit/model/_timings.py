@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import Guess, MeasuredSignal, real_numbers, require_start
@@ -24,7 +25,6 @@ from lagjax._run import crossings, sections_of, simulate
 from lagjax._run.hybrid import Hybrid, Scene, Transition
 from lagjax._scene import System
 
-PyTree = Any
 _BUDGET = 10_000_000  # steps: observations last for thousands of periods
 _PATIENCE = 2.0  # mean times between crossings that are waited for behind the last one: a trial may come later
 

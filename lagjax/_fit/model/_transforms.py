@@ -23,7 +23,6 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import helmert
 
-PyTree = Any
 _STRAIGHT = 1e-10  # of the largest roughness: below it a function is not rough but by rounding
 
 

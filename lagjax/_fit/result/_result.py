@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._fit.model._density import Density
 from lagjax._fit.model._noise import AbstractNoise, NoiseScale
@@ -31,8 +32,6 @@ from lagjax._fit.search._multistart import Waterfall
 from lagjax._fit.search._unexplained import Unexplained, measure_unexplained
 from lagjax._primitives import with_doubles
 from lagjax._show import html_cell, import_package
-
-PyTree = Any
 
 
 class Covariance(NamedTuple):

@@ -111,7 +111,7 @@ class Edition:
         finally:
             _inside.is_traced = False
             if self._watch is not None:
-                self._watch.settle()
+                self._watch.drop_own_writes()
 
 
 def _pickled_edition(function: Callable) -> Edition:
@@ -158,7 +158,7 @@ class _Watch:
                 return walk, text
             wanted = names
 
-    def settle(self) -> None:
+    def drop_own_writes(self) -> None:
         """After a call: stop watching places that the function itself has written to."""
         latest = self._latest
         if latest is None or latest[0].hold():

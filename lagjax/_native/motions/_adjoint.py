@@ -53,7 +53,7 @@ class Adjoint:
         if parts.projection is not None:
             steps.insert(0, ProjectedEnd(motion, parts).pull(cotangents))
         if (saltation := self.replay.saltation()) is not None:
-            steps = [saltation.pull(cotangents), *steps, saltation.note_after()]
+            steps = [saltation.pull(cotangents), *steps, saltation.store_next_pieces()]
         self._run_function(steps)
         motion.write_begin(self.start_next)
         motion.finish()

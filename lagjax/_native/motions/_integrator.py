@@ -62,9 +62,7 @@ class Integrator:
         fields = StepControl.fields(n) | OutputWriter.fields(n) | Events.fields(self.guards)
         fields["active"] = 1  # 1 in a lane that has a member
         if projection is not None:
-            self.begins = _rank_drops.step_start_fields(
-                2 * n, self.guards, 0 if borders is None else len(borders.guards)
-            )
+            self.begins = _rank_drops.start_fields(2 * n, self.guards, 0 if borders is None else len(borders.guards))
             fields |= Projector.fields(n) | _rank_drops.fields(self.begins)
         if guards is not None:
             fields |= Roots.fields(MAX_ORDER + 2)
@@ -114,7 +112,7 @@ class Integrator:
         largest = code.maximum(abs(begin), abs(end))
         lane["smallest"] = code.maximum(SMALLEST_STEP * largest, double(code, LEAST_STEP))
         lane["longest"] = code.maximum(abs(end - begin) * FIRST_STEP, lane["smallest"])
-        self.output.await_next(frame, lane, integer(code, 1))
+        self.output.set_due_time(frame, lane, integer(code, 1))
         for i in motion.form.each(code, self.base_size if self.projector else 0):
             lane["velocity_scale", i] = 0.0
         for i in motion.form.each(code, motion.states):
@@ -151,9 +149,9 @@ class Integrator:
             if self.projector is not None:
                 _rank_drops.retry_last_long_step(frame, self.motion.form, self.begins)
             if self.events is not None:
-                self.events.stop(frame, order)
+                self.events.end_step_at_event(frame, order)
             if crossings is not None:
-                crossings.settle(frame)
+                crossings.drop_missed_border(frame)
             with code.only_if(frame.job("room") > 0), code.loop(self.motion.width) as lane:
                 retracts = crossings is not None and crossings.crossing.retraction is not None
                 self.output.record(frame, frame.lane(lane), kicks, "unretracted" if retracts else "y")

@@ -68,7 +68,7 @@ class Steps(NamedTuple):
     kernel: Any = None
     rows: Any = None
 
-    def take(self, places) -> "Steps":
+    def select_members(self, places) -> "Steps":
         return self._replace(first=self.first[places], counts=self.counts[places], rows=self.rows[places])
 
     def split_members(self) -> Iterator[tuple[int, np.ndarray]]:

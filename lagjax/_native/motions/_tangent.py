@@ -41,7 +41,7 @@ class Tangent:
         self.replay = StepReplay("tangent", parts, JOB, fields, {}, width, jumps=1)
         self.motion = motion = self.replay.motion
         self.saltation, self.retraction = self.replay.saltation(), self.replay.retraction
-        self.note_border = self.saltation and self.saltation.note_end()
+        self.note_border = self.saltation and self.saltation.store_end()
         self.directions = directions = Directions(motion, parts, lanes)
         self.form, self.series_sum = directions.form, SeriesSum(motion)
         self.start_next = self.replay.start_next(self._begin_lane, lambda frame, lane, member: None)

@@ -77,7 +77,7 @@ class Tables:
             with code.loop(count) as i:
                 yield i
 
-    def strands(self, code: Code, n: int) -> Iterator[tuple[list, dict]]:
+    def component_groups(self, code: Code, n: int) -> Iterator[tuple[list, dict]]:
         """A loop over coordinates: each gives [coordinate, velocity], and {1: coordinate} for the velocity."""
         for i in self.each(code, n):
             yield [i, i + n], {1: i}

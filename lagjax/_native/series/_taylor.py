@@ -193,7 +193,7 @@ class TaylorSeries:
         """P(s) − y for every component of the state, P′(s) for velocities, by Horner's scheme."""
         code, increments, slopes = frame.code, self.form.room(frame, self.states), self.form.room(frame, self.n)
         s = code.lanes_of(s)
-        for some, velocities in self.form.strands(code, self.n):
+        for some, velocities in self.form.component_groups(code, self.n):
             highest = [frame["y", i, order] for i in some]
             value = [code.variable(c) for c in highest]
             slope = {j: code.variable(code.as_number(order) * highest[j]) for j in velocities}

@@ -106,7 +106,7 @@ class BorderControl:
         frame["planned"], frame["nearest"] = h, 1.0
         frame["crossed"], frame["crossed_number"], frame["beyond"] = Crossed.NOTHING, 0.0, 0.0
         if self.pieces:
-            self.knots.look(frame, h)
+            self.knots.end_step_at_knot(frame, h)
             self._record_levels(frame)
             if self.slides:
                 frame["slides"] = 0.0
@@ -116,7 +116,7 @@ class BorderControl:
                 self._record_crossing(frame, border, degree, h)
             if self.table.groups:
                 self._join_crossings(frame, h)
-        self.narrow.look(frame, degree, h)
+        self.narrow.end_step_at_feature(frame, degree, h)
         cut = frame["nearest"] < 1.0
         if self.pieces and self.kicks is not None:
             self.kicks.kick_at_end(frame, self.roots, degree, h)
@@ -170,7 +170,7 @@ class BorderControl:
         turns = code.select(turns < limits.MOST_TURNS, turns, limits.MOST_TURNS)
         patience = (turns * turns) * (turns * turns) * turns
         atol = code.lanes_of(absolute_tolerance(frame))
-        nothing = self.roots.size(frame, degree) <= limits.NEGLIGIBLE * atol * patience
+        nothing = self.roots.coefficient_sum(frame, degree) <= limits.NEGLIGIBLE * atol * patience
         touches = border.touch > Touch.NONE
         if self.slides:  # along u = 0 another border of |u| is there by rounding
             touches = touches | (frame["slides"] > 0.0)
@@ -190,7 +190,7 @@ class BorderControl:
         at_rest = (border.touch > Touch.NONE) | (abs(frame["poly", 1]) <= gain)
         # A number that is zero leaves zero as its first coefficient says, or stays.
         leaves = undecided & code.compare("!=", leads, 0.0)
-        root = code.select(undecided, code.select(leaves, 0.0, 2.0), self.roots.place(frame, 2.0))
+        root = code.select(undecided, code.select(leaves, 0.0, 2.0), self.roots.step_fraction(frame, 2.0))
         instant = limits.NO_TIME * frame["smallest"] / abs(h)
         root = code.select(comes & (root < instant) & (instant < 1.0), instant, root)
         is_root = leaves | (~undecided & self.roots.is_found(frame))
@@ -269,13 +269,13 @@ class BorderControl:
         """True if the motion can slide along a border on which other switching numbers depend."""
         return bool(self.borders.holding.groups)
 
-    def settle(self, frame: Frame) -> None:
+    def drop_missed_border(self, frame: Frame) -> None:
         """Drop the border of a step that was shortened and does not reach it."""
         code = frame.code
         frame["crossed"] = code.select(reaches_border(frame), frame["crossed"], Crossed.NOTHING)
         frame["stepped"] = stepped = code.compare("!=", frame["h"], 0.0)
         if self.kicks is not None:
-            stepped = self.kicks.settle(frame, stepped)
+            stepped = self.kicks.mark_recorded_steps(frame, stepped)
         at_knot = (frame["stepped"] > 0.0) & (frame["crossed"] > Crossed.GUARD)
         frame["at_knots"] = frame["at_knots"] + code.flag(at_knot)
         frame.assign(stepped, is_hit=0.0, grazes=0.0, stops=0.0)

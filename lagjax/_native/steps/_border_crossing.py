@@ -41,7 +41,7 @@ class BorderCrossing:
         if jump is not None:
             saltation = Saltation(motion, self.table, nesting.base, jump)
             motion.layout.extend_by(saltation.fields_along())
-            self.jump = saltation.note(), saltation.apply()
+            self.jump = saltation.store_state(), saltation.apply()
         self.kicks = Kicks(motion, borders, self.table, nesting.base) if borders.kicking else None
         self.cross = self._cross_borders()
 
@@ -110,7 +110,7 @@ class BorderCrossing:
         before = [code.variable(before[k]) for k in range(len(shaken))]
         for border in self.table.each(frame):
             self._enter_beyond(frame, border)
-        self.knots.cross(frame, going)
+        self.knots.enter_next_pieces(frame, going)
         self._redecide_dependents(frame, going)
         after = self.motion.evaluate_now(frame, line) if shaken else []
         for k, j in enumerate(shaken):

@@ -32,7 +32,7 @@ class Kicks:
         with frame.code.loop(self.motion.pieces) as j:
             frame["kick_before", j] = self.table.piece(frame, j)
 
-    def settle(self, frame: Frame, stepped: Value) -> Value:
+    def mark_recorded_steps(self, frame: Frame, stepped: Value) -> Value:
         """Set `counts` for steps that are recorded: also those of no length that end with a kick, and the last one."""
         stepped = stepped | (self.table.kicks(frame) & ~self._begins_past_jump(frame))
         frame["counts"] = stepped | (frame["last"] > 0.0)

@@ -192,7 +192,7 @@ class Events:
 
     # ---- a step ----
 
-    def stop(self, frame: Frame, order: Value) -> None:
+    def end_step_at_event(self, frame: Frame, order: Value) -> None:
         """Search the step for changes of all guards; it ends at the earliest, or where a series is not accurate."""
         code, planned = frame.code, frame["h"]
         frame.call(self.begin_sides, order)
@@ -263,7 +263,7 @@ class Events:
 
     def _search_roots(self, watch: Watch, order: Value, degree: Value, side: Value, moving: Value) -> None:
         frame, code, roots, h = watch.frame, watch.code, self.roots, watch.frame["h"]
-        size, contact, start = roots.size(frame, degree), watch.recall("contact"), frame["poly", 0]
+        size, contact, start = roots.coefficient_sum(frame, degree), watch.recall("contact"), frame["poly", 0]
         unknown = moving & ~(abs(start) < float("inf"))
         frame.assign(unknown, code=float(limits.NOT_FINITE), last=0.0, h=0.0)
         sound, moving = size < float("inf"), moving & ~unknown
@@ -272,7 +272,7 @@ class Events:
 
         def is_long():
             last, before = (roots.last_terms(frame, degree, first) for first in (0, 3))
-            return self._is_truncated(watch, last, before, roots.size(frame, degree))
+            return self._is_truncated(watch, last, before, roots.coefficient_sum(frame, degree))
 
         roots.shorten(frame, degree, is_long)
         frame["doubt"], frame["begin"], frame["closer"] = roots.last_terms(frame, degree), 0.0, 1.0
@@ -280,7 +280,7 @@ class Events:
         continues = (contact < Touch.NONE) & (abs(start) <= limits.CONTINUOUS * size)
         powers = code.select(continues, float(Touch.VALUE), contact)
         roots.divide(frame, degree, powers)
-        roots.sum_up(frame, degree)
+        roots.store_bounds(frame, degree)
         frame["instant"] = 0.25 * frame["smallest"] / (abs(h) * frame["part"])  # no time is known better than this
         rounding = (limits.ROOT_NOISE * limits.EPS) * watch.recall("kept")
         matters = (rounding < float("inf")) & ~(powers > Touch.NONE)
@@ -310,7 +310,7 @@ class Events:
             frame.call(self.roots.next_root, degree)
             root = frame["root"]
             is_root = searching() & self.roots.is_found(frame)
-            self._limit_accurate_part(frame, searching() & ~is_root, self.roots.place(frame, 1.0))
+            self._limit_accurate_part(frame, searching() & ~is_root, self.roots.step_fraction(frame, 1.0))
             waits = is_root & self._ends_at_border(watch)
             watch.remember(waits, contact_end=Touch.CONTINUES)
             changes = is_root & ~waits
@@ -318,7 +318,7 @@ class Events:
                 s = self._refine_root(watch, order, changes, ahead.value)
                 inside = abs(s) <= abs(frame["h"])  # else of the next step
                 goes_on = self._take_changes(watch, order, changes & inside, s, ahead)
-                self.roots.turn(frame, degree, goes_on)
+                self.roots.negate(frame, degree, goes_on)
                 frame.assign(goes_on, begin=root)
                 looking.value = code.flag(goes_on)
             looking.value = code.select(changes, looking.value, 0.0)
@@ -342,7 +342,7 @@ class Events:
         """The time of a root, by Newton steps on the guard itself; 0 for a jump of the guard."""
         frame, code, root = watch.frame, watch.code, watch.frame["root"]
         scale = frame["part"] * frame["h"]
-        start, rate = root * scale, self.roots.whole_slope(frame) / scale
+        start, rate = root * scale, self.roots.undivided_slope(frame) / scale
         moving = code.flag(where & (root > 0.0))
         # Behind a zero the series knows a root that is near, which the value loses in its rounding.
         most, share = 0.1 * abs(scale), 0.5 * abs(start)

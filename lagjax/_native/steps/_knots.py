@@ -14,7 +14,7 @@ class Knots:
     def __init__(self, motion: TaylorSeries, borders: Borders, table: GuardTable):
         self.motion, self.borders, self.table = motion, borders, table
 
-    def look(self, frame: Frame, h: Value) -> None:
+    def end_step_at_knot(self, frame: Frame, h: Value) -> None:
         """End the step at the first knot of all tables."""
         clocks = sorted(enumerate(self.borders.clocks), key=lambda clock: clock[1] not in self.borders.kicking)
         for c, j in clocks:
@@ -22,7 +22,7 @@ class Knots:
         if self.table.movable and len(clocks) > 1:
             self._record_coincidence(frame, h)
 
-    def cross(self, frame: Frame, going: Value) -> None:
+    def enter_next_pieces(self, frame: Frame, going: Value) -> None:
         """Enter the next piece of every table that has a knot at this instant."""
         for j in self.borders.clocks:
             left, inside = self._time_to_knot(frame, j)

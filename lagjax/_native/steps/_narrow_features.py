@@ -18,7 +18,7 @@ class NarrowFeatures:
     def __init__(self, motion: TaylorSeries, roots: Roots, features: tuple[Feature, ...]):
         self.motion, self.roots, self.features = motion, roots, features
 
-    def look(self, frame: Frame, degree: Value, h: Value) -> None:
+    def end_step_at_feature(self, frame: Frame, degree: Value, h: Value) -> None:
         """End the step before the first of all features."""
         frame["next_approach"], first = 0.0, 0
         for feature, row in itertools.groupby(self.features):  # which shares its code: as of a chain's bonds
@@ -69,13 +69,13 @@ class NarrowFeatures:
             of_size = code.select(far, limits.ARGUMENT * limits.LARGEST_FALL, of_size)
         self.roots.polynomial(frame, j, degree, h, slope, u - start / slope)
         if kind == FALLS:  # one that rises is told by fewer terms
-            self.roots.sum_up(frame, degree)
+            self.roots.store_bounds(frame, degree)
             rises = frame["falls"] < start
             size = start + frame["rises"]
             matters = matters & ~(rises & (self.roots.last_terms(frame, degree) < limits.ARGUMENT * size))
         self.roots.shorten_to(frame, degree, of_size, absolute)
         frame.call(self.roots.first_root, degree)
-        root = self.roots.place(frame, 2.0)
+        root = self.roots.step_fraction(frame, 2.0)
         if kind in (UP_TO, FALLS):
             matters, root = self._approach(frame, kind, h, matters, root)
         sooner = matters & (root > 0.0) & (root < frame["nearest"]) & code.compare("!=", h, 0.0)

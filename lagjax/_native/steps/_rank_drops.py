@@ -11,7 +11,7 @@ from lagjax._native.series._tables import Tables
 from lagjax._native.steps._events import MEMORY
 
 
-def step_start_fields(states: int, guards: int, borders: int) -> dict[str, int]:
+def start_fields(states: int, guards: int, borders: int) -> dict[str, int]:
     """The sizes of the fields that define the start of a step, for `guards` of events and guards of `borders`."""
     of_guards = dict.fromkeys(MEMORY, guards) | {"touch": borders}
     return dict.fromkeys(("y", "low"), states) | of_guards | dict.fromkeys(("t", "t_low", "steps"), 1)

@@ -38,7 +38,7 @@ class OutputWriter:
         """The index in `path` of component i of the state at an output time of a member."""
         return (member * frame.job("times") + time_index) * self.motion.states + i
 
-    def await_next(self, frame: Frame, lane: Lane, index: Value) -> None:
+    def set_due_time(self, frame: Frame, lane: Lane, index: Value) -> None:
         """Set `due` to the next output time before the end, in the direction of the motion; infinite after the last."""
         code = frame.code
         lane["output"] = index
@@ -72,7 +72,7 @@ class OutputWriter:
                     member, index = lane["member"], lane["output"]
                     for i in self.motion.form.each(code, self.motion.states):
                         frame.write("path", self.place(frame, member, index, i), lane["between", i])
-                    self.await_next(frame, lane, index + 1)
+                    self.set_due_time(frame, lane, index + 1)
 
     def interpolate(self, frame: Frame, order: Value, s: Value) -> None:
         """Store in `between` the state at time s after the current one, projected if that is near."""

@@ -109,7 +109,7 @@ class Saltation:
 
     # ---- in a run: the motion with its tangents ----
 
-    def note(self) -> Code:
+    def store_state(self) -> Code:
         """Emit `()`: store the state at the border where a step ends; several may be crossed there in turn."""
         frame = self.motion.function("note_before")
         stepped = self.table.counts(frame)
@@ -153,7 +153,7 @@ class Saltation:
             frame["edge", i] = moved[i]
         frame["edge_t"], frame["edge_grazes"] = frame["t"] + frame["h"], frame["grazes"]
 
-    def note_end(self) -> Code:
+    def store_end(self) -> Code:
         """Emit `()`: store the state at the border where a step ends, for tangents at the start of the next one."""
         frame = self.motion.function("note_end")
         frame["is_hit"] = Hit.NONE
@@ -205,7 +205,7 @@ class Saltation:
             cotangents.store_entries(frame, tables, entries, 0)
         return frame.finish()
 
-    def note_after(self) -> Code:
+    def store_next_pieces(self) -> Code:
         """Emit `()`: store the pieces of a step, for cotangents at the end of the step before it."""
         frame = self.motion.function("note_after")
         with frame.code.loop(self.motion.pieces) as j:

@@ -88,13 +88,15 @@ def _put_on_device(trajectory: Trajectory) -> Trajectory:
 
 def simulate_contact_batch(given: Batch, batch: Batch, max_transitions: int | None, params, params_axes) -> Trajectory:
     """The motions of a batch whose system has contacts."""
-    plan, *_ = _plan_contacts(batch.whole, max_transitions)
+    plan, *_ = _plan_contacts(batch.with_all_times, max_transitions)
     if batch.is_known:
         found = run_rows(functools.partial(integrate_concrete, plan), batch.member, batch.ts, batch.y0, batch.vectors)
     else:
         found = batch.map_members(lambda problem: run_in_doubles(functools.partial(contact_motion, plan), problem))
     ending, record, impacts = found
-    trajectory = _trajectory(given.whole, batch.whole, ending, record, impacts, None, plan.max_transitions, params_axes)
+    trajectory = _trajectory(
+        given.with_all_times, batch.with_all_times, ending, record, impacts, None, plan.max_transitions, params_axes
+    )
     return dataclasses.replace(_put_on_device(trajectory), params=params)
 
 

@@ -96,7 +96,7 @@ def contact_motion(
     ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
     numbers, scene = eqx.filter(params, eqx.is_array_like), scene_of(plan, layout, params, len(ts))
     given = ts, y0, vector_of(numbers).astype(float), scene.flat.restitution(numbers), scene.flat.friction(numbers)
-    return _arrange_outcome(scene, *scene.replay.follow(*given), given[:3])
+    return _arrange_outcome(scene, *scene.replay.search_and_replay(*given), given[:3])
 
 
 def integrate_concrete(plan: ContactPlan, layout: Layout, params: PyTree, ts, y0, vectors) -> tuple:

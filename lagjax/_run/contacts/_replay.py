@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._engine.taylor import Line, Surfaces, integrate_stretch, move_to_zero
+from lagjax._engine.taylor import Line, Surfaces, move_to_zero, run_stretch
 from lagjax._interface import halves
 from lagjax._primitives import differentiable_where, limit_directions
 from lagjax._run.contacts._contact_search import HELD, POISSON
@@ -71,9 +71,7 @@ class ContactReplay(Replay):
         ts, y0, vector, restitution, friction = given
         (t, y), decides, still = start, row.decides > 0, jax.lax.stop_gradient
         numbers = jnp.concatenate([vector, row.did])
-        path, *stop = integrate_stretch(
-            self._flow(), self._find_watches(), self.code.tolerances, times, y, numbers, *event
-        )
+        path, *stop = run_stretch(self._flow(), self._find_watches(), self.code.tolerances, times, y, numbers, *event)
         ended = self._end_effects((*stop, vector, t, y, halves(y0)[1], restitution, friction), record)
         is_behind = np.isin(np.arange(ended.size), np.arange(*self._ends[5:7]))
         smooth = (still(ended[0]) > 0) & (~is_behind | ~decides | (row.leaves_rest == 0))

@@ -33,14 +33,7 @@ from lagjax._interface import (
     require_flag,
     result_from,
 )
-from lagjax._run._trajectory import (
-    RunSettings,
-    Trajectory,
-    raise_unless_ok,
-    run_in_doubles,
-    run_single,
-    step_counts,
-)
+from lagjax._run._trajectory import RunSettings, Trajectory, raise_unless_ok, run_in_doubles, run_single, step_counts
 from lagjax._run.hybrid._mode import Transition
 from lagjax._run.hybrid._transition_motion import HybridPlan, hybrid_motion, integrate_concrete
 from lagjax._run.hybrid._transition_search import IN_ONE_PLACE

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from lagjax._engine.taylor import Line, integrate_stretch, move_to_zero
+from lagjax._engine.taylor import Line, move_to_zero, run_stretch
 from lagjax._primitives import differentiable_where
 from lagjax._run._trajectory import constant_unless
 from lagjax._run.hybrid._mode import ModeParts
@@ -54,7 +54,7 @@ class HybridReplay(Replay):
             if len(self.parts) > 1:
                 t, y, numbers = constant_unless(here, (t, y, vector))
             of_mode = jnp.where(here, times, t), y, numbers, jnp.where(here, end, t), stop, k, crosses & here
-            outputs, *at = integrate_stretch(parts.make_flow(), parts.surfaces, self.code.tolerances, *of_mode)
+            outputs, *at = run_stretch(parts.make_flow(), parts.surfaces, self.code.tolerances, *of_mode)
             parts_of_end = (*at, numbers, t, y)
             found = self._end_effects(place, (record, *jax.lax.stop_gradient(parts_of_end[:3]), *parts_of_end))
             found = differentiable_where(jax.lax.stop_gradient(found[0]) > 0, found[1:], *at, numbers)

@@ -49,12 +49,12 @@ def start_member(scene: Scene, member: Member, ts: Floats, path: Floats, did: Fl
         member.result = float(NOT_FINITE)
     else:
         member.result = float(
-            INCONSISTENT if violates_constraints(scene, find_mode(scene, member), member.x, room) else GOING
+            INCONSISTENT if is_inconsistent(scene, find_mode(scene, member), member.x, room) else GOING
         )
 
 
 @loop
-def violates_constraints(scene: Scene, mode: int, x: Floats, room: Room) -> bool:
+def is_inconsistent(scene: Scene, mode: int, x: Floats, room: Room) -> bool:
     """True if the state at inputs x violates the constraints of a mode."""
     if scene.checks[mode] == 0:
         return False
@@ -238,7 +238,7 @@ def pass_transition(
     if not sound and (happens or result == SUCCESSFUL):  # a reset may give NaN, and a guard that is NaN never fires
         result = NOT_FINITE
     elif happens:
-        result = INCONSISTENT if violates_constraints(scene, scene.target[j], after, room) else GOING
+        result = INCONSISTENT if is_inconsistent(scene, scene.target[j], after, room) else GOING
     if happens:
         row.happens, row.decides, row.number, row.target = 1.0, 1.0, float(scene.number[j]), float(scene.target[j])
         copy(after, x, 2 * n)

@@ -13,19 +13,6 @@ from lagjax._run.jumps._round_replay import Replay, concatenate, mask_rows
 from lagjax._run.jumps._scene_code import Found, JumpLaw, Mode, SceneCode, tolerances_of
 
 __all__ = [
-    "GOING",
-    "LEAST",
-    "Found",
-    "JumpLaw",
-    "Mode",
-    "Places",
-    "Replay",
-    "SceneCode",
-    "bind_law",
-    "bind_loops",
-    "concatenate",
-    "copy",
-    "find_sign",
-    "mask_rows",
-    "tolerances_of",
+    "GOING", "LEAST", "Found", "JumpLaw", "Mode", "Places", "Replay", "SceneCode", "bind_law", "bind_loops",
+    "concatenate", "copy", "find_sign", "mask_rows", "tolerances_of",
 ]  # fmt: skip

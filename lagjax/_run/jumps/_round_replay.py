@@ -57,7 +57,7 @@ class Replay:
         """The fields of `played`, from the arguments of a search."""
         raise NotImplementedError
 
-    def follow(self, *given) -> tuple[Found, Any, Any]:
+    def search_and_replay(self, *given) -> tuple[Found, Any, Any]:
         """The findings of a search, the rows of its record, and the replayed results, which have derivatives."""
         found = self.code.search(*jax.lax.stop_gradient(given))
         row, played = self.read(found)

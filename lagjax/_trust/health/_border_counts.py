@@ -10,7 +10,7 @@ import numpy as np
 
 from lagjax._engine import Problem
 from lagjax._engine.taylor import Flow, Tolerances, flow_of, split_portions
-from lagjax._equations import derivation_of, list_motion_decisions
+from lagjax._equations import derivation_of, list_decisions
 from lagjax._interface import Layout
 from lagjax._native import Crossed
 from lagjax._program import Unlowerable
@@ -65,7 +65,7 @@ def is_piecewise(system: System, layout: Layout, params) -> bool:
     try:
         return derivation.borders is not None and bool(derivation.borders.switches)
     except Unlowerable:  # arrays; as `_explanation` asks
-        return bool(list_motion_decisions(derivation.motion, *derivation.state_shapes))
+        return bool(list_decisions(derivation.motion.functions, *derivation.state_shapes))
 
 
 def _count_contacts(flow: Flow, ts, y0, params, tolerances: Tolerances, steps, places, into: BorderCounts) -> None:
@@ -76,7 +76,7 @@ def _count_contacts(flow: Flow, ts, y0, params, tolerances: Tolerances, steps, p
     # The time reaches entries of tables, too, which are no borders.
     enters, leaves = (np.array([getattr(guard, name) >= 0 for guard in guards] + [False]) for name in ("slide", "on"))
     slides = sorted({guard.slide for guard in guards if guard.slide >= 0})
-    for run in flow.follow(ts, y0, params, tolerances, 2 * int(steps.sum()) + len(places))[1]:
+    for run in flow.run_and_record(ts, y0, params, tolerances, 2 * int(steps.sum()) + len(places))[1]:
         for row, table in run.split_members():
             place, (crossed, number), grazes = places[row], table[:, -3:-1].astype(int).T, table[:, -1] > 0
             along = table[:, flow.states + 4 : flow.states + 4 + pieces][:, slides] > 0.5

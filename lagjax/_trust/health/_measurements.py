@@ -175,8 +175,8 @@ def _measure_concrete(members: Members, laws: list[Law]) -> dict[str, Any]:
     with np.errstate(all="ignore"):
         decides = any(borders_of(law.derivation) is not None for law in laws)
         decided = evaluate_law(lambda law, sample: sample.pieces()) if decides else None
-        between = Rates(evaluate_law(Law.powers), evaluate_law(Law.accelerations), decided)
-        fields = measure_path(path, laws, momenta, partial(evaluate_by_mode, measure_sample), between)
+        between = Rates(evaluate_law(Law.energy_rates), evaluate_law(Law.accelerations), decided)
+        fields = _measure(path, laws, momenta, partial(evaluate_by_mode, measure_sample), between)
     return jax.tree.map(lambda x: jnp.asarray(np.reshape(x, members.batch + np.shape(x)[1:])), fields)
 
 
@@ -208,7 +208,7 @@ def _measure_traced(trajectory, axes, tree, steps):
             evaluate_in_chunks(lambda law, *state: law.power_at(*state, numbers)),
             evaluate_in_chunks(lambda law, *state: law.motion.acceleration(*state, numbers)),
         )
-        return measure_path(path, laws, momenta, sample, between)
+        return _measure(path, laws, momenta, sample, between)
 
     return trajectory.map_members(one, steps, trajectory.transitions) | names
 
@@ -256,9 +256,7 @@ def _pad_constraints(measured: Measurements, laws: list[Law], index: int) -> Mea
     return measured._replace(distances=pad(measured.distances), rates=pad(measured.rates))
 
 
-def measure_path(
-    path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample: Callable, between: "Rates"
-) -> dict:
+def _measure(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample: Callable, between: "Rates") -> dict:
     """Return all measured fields; `sample(q, qdot, t, mode)` returns the `Measurements` at states."""
     xp, axis, T, dtype = path.library, path.time, path.ts.shape[-1], path.q.dtype
     q, qdot, t, mode = path[:4]
