@@ -98,7 +98,7 @@ class Follower:
         self.period_is_free = not arcs.driven and (place is None or not arcs.conserves)
 
     def closing_conditions(self, numbers: np.ndarray) -> Closing:
-        return Closing.without_image(self.arcs.with_numbers(numbers))
+        return Closing.from_arcs(self.arcs.with_numbers(numbers))
 
     def orbit_point(self, y, period, parts, numbers) -> FamilyPoint:
         """Return the chain through these states, (1, K, 2n), and its closing equations."""

@@ -157,7 +157,7 @@ def _closing_conditions(arcs: Arcs, energy, image) -> Closing:
         energy = float(energy)
         if not arcs.conserves:
             raise ValueError("energy=... asks for an energy, but that of this scene is not conserved: leave it out.")
-    plain = Closing.without_image(arcs, energy)
+    plain = Closing.from_arcs(arcs, energy)
     if image is None:
         return plain
     layout, states = arcs.layout, 2 * arcs.size

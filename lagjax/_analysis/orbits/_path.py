@@ -189,7 +189,7 @@ def find_path(
     ends = [np.asarray(concatenate_leaves(of_one, np.dtype(float))) for of_one in leaves]
     times = np.linspace(float(t_start), float(t_end), _ARCS + 1)
     first = _guess_states(layout, guess, ends, times)
-    closing = Closing.without_image(arcs)._replace(t_first=times[0], q_end=ends[1])
+    closing = Closing.from_arcs(arcs)._replace(t_first=times[0], q_end=ends[1])
     parts = np.linspace(0.0, 1.0, _ARCS + 1)[None]
     chain = close_chains(closing, first[None], times[-1:] - times[:1], parts, _path_units(arcs, first, ends, times))
     message = _explain_no_path(closing, chain, times)

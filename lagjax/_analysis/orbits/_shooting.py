@@ -52,7 +52,7 @@ class Closing(NamedTuple):
     q_end: np.ndarray | None = None
 
     @classmethod
-    def without_image(cls, arcs: Arcs, energy: float | None = None) -> "Closing":
+    def from_arcs(cls, arcs: Arcs, energy: float | None = None) -> "Closing":
         return cls(arcs, np.eye(2 * arcs.size), np.zeros(2 * arcs.size), energy)
 
     @property
