@@ -101,7 +101,7 @@ def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, me
 
 
 def _shade_spans(ax, trajectory: Trajectory) -> bool:
-    """Spans of the modes of one motion, at the lower edge of closed contacts, seven of either; False without any."""
+    """Draw the spans of modes, and at the lower edge those of closed contacts; return False without any."""
     spans = spans_of(trajectory) if np.size(trajectory.ok) == 1 else {}
     for k, (color, (name, times)) in enumerate(zip(reversed(COLORS), spans.items(), strict=False)):
         low, high, opacity = (STRIP * k, STRIP * (k + 1), 0.4) if trajectory.mode is None else (0.0, 1.0, 0.12)
@@ -111,7 +111,7 @@ def _shade_spans(ax, trajectory: Trajectory) -> bool:
 
 
 def _mark_impacts(ax, impacts: Impacts, members: int) -> bool:
-    """Marks at the lower edge for the impacts of each contact, the first seven of more; False without any."""
+    """Mark the impacts of up to seven contacts at the lower edge; return False if there are none."""
     t, before = np.atleast_2d(impacts.t), len(ax.lines)
     t = t.reshape(-1, t.shape[-1])
     chosen, columns = even_places(len(t), members), columns_of({"impact": impacts.impulse}, np.ndim(impacts.t))
@@ -186,7 +186,7 @@ def phase(trajectory: Trajectory, *coordinates: str, members: int = 30, period: 
 
 
 def _coordinate_places(layout: Layout, coordinates: tuple[str, ...], most: int = len(COLORS)) -> list[int]:
-    """The places of coordinates by their names; the first ones, at `most`, where none is named."""
+    """The indices of named coordinates; of the first `most` if none is named."""
     if not coordinates:
         return list(range(min(layout.size, most)))
     if unknown := [name for name in coordinates if name not in layout.names]:
@@ -227,7 +227,7 @@ def compare(one: Trajectory, other, *coordinates: str, figure=None):
 
 
 def _comparison_curve(other, layout: Layout) -> tuple[np.ndarray, np.ndarray, str]:
-    """The times (T,), the values (T, n) and the style of what a motion is compared with."""
+    """Times (T,), values (T, n) and line style of `other`: a trajectory, a record, or a pair (ts, values)."""
     if isinstance(other, Trajectory):
         _require_numbers(other, "other")
         of_other, course = course_of(other)
@@ -297,7 +297,7 @@ def _describe_rates(modes: Modes, k: int) -> str:
 
 
 def _align_phases(shapes):
-    """The real parts of shapes, each turned by the phase at which the sum of their squares is largest."""
+    """Real shapes from complex ones, each turned by the phase that maximises the sum of squares."""
     total = sum(jnp.sum(jnp.square(leaf).reshape(len(leaf), -1), axis=1) for leaf in jax.tree.leaves(shapes))
     turn = jnp.exp(-0.5j * jnp.angle(total))
     return jax.tree.map(lambda leaf: jnp.real(leaf * turn.reshape(-1, *[1] * (leaf.ndim - 1))), shapes)
@@ -314,7 +314,7 @@ def _deviation_bars(ax, shape) -> None:
 
 
 def _draw_swings(ax, points: Function, q, shape, params, largest: float) -> None:
-    """The points at an equilibrium, and where a coordinate has moved by `largest` along a shape, to both sides."""
+    """Draw the points at an equilibrium, and displaced along a shape to both sides by at most `largest`."""
     size = max(float(jnp.max(jnp.abs(leaf))) for leaf in jax.tree.leaves(shape))
     for swing, color, style in ((0.0, GREY, "-"), (-largest, COLORS[5], "--"), (largest, COLORS[0], "-")):
         at = jax.tree.map(lambda x, dx, s=swing: jnp.asarray(x) + s / size * dx, q, shape)
@@ -404,7 +404,7 @@ def return_map(crossings: Crossings, value: Callable, *, ax=None):
 
 
 def _section_points(crossings: Crossings, projection: Callable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """x and y of all crossings, and the member that each belongs to. Raises `ValueError` where there are none."""
+    """x and y of all crossings, and the member of each. Raises `ValueError` if there are none."""
     _require_result(crossings, "crossings", Crossings, "crossings", " for one section")
     t = np.asarray(crossings.t)
     if not np.isfinite(t).any():
@@ -522,7 +522,7 @@ def energy_error(trajectory: Trajectory, *, scale: float | None = None, ax=None)
 
 
 def _loses_at_transitions(trajectory: Trajectory, h: np.ndarray) -> bool:
-    """True if a transition changes the energy by more than rounding, as a fraction of the largest one."""
+    """True if a transition changes the energy h by more than rounding."""
     if (changes := trajectory.transitions) is None:
         return False
     sides = (changes.q, changes.qdot, changes.source), (changes.q_next, changes.qdot_next, changes.target)

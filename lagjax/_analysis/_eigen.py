@@ -18,7 +18,7 @@ import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 from jaxtyping import Array, Float
 
-from lagjax._equations import decide, factorize, least_norm
+from lagjax._equations import factorize, least_norm, truncated_svd
 
 Matrix = Float[Array, "n n"]
 
@@ -171,7 +171,7 @@ def _null_space(rows: Float[Array, "m n"], rank: int) -> Float[Array, "n n-rank"
     lengths = jnp.linalg.norm(rows, axis=1, keepdims=True)
     unit = jax.lax.stop_gradient(rows / jnp.where(lengths > 0, lengths, 1))
     shape = (jax.ShapeDtypeStruct((n, n - rank), rows.dtype),)
-    return _call_numpy(lambda g: _map_finite(lambda a: [decide(a).right[:, rank:]], g), shape, unit)[0]
+    return _call_numpy(lambda g: _map_finite(lambda a: [truncated_svd(a).right[:, rank:]], g), shape, unit)[0]
 
 
 def tangent_basis(jacobian: Float[Array, "m n"], rank: int) -> Float[Array, "n n-rank"]:

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from lagjax._analysis._scene_state import SceneState
-from lagjax._equations import Sample, decide, echelon_form
+from lagjax._equations import Sample, echelon_form, truncated_svd
 from lagjax._interface import halves, is_concrete
 
 # States, beside two for each number of Ω, and the numbers of Ω up to which it is sought: of more coordinates that
@@ -72,7 +72,7 @@ def find_symmetries(scene: SceneState, preferred: np.ndarray) -> SteadySymmetrie
         terms, rates = _evaluate_terms(scene, params, steps, *states)
         consistent, of_rates = states[1], terms
         if rates.size:  # one step arrives: a is affine in q̇, as d'Alembert's principle takes it
-            consistent = states[1] - decide(np.nan_to_num(terms.rate_by_qdot), _SINGULAR).least_norm(rates)
+            consistent = states[1] - truncated_svd(np.nan_to_num(terms.rate_by_qdot), _SINGULAR).least_norm(rates)
             of_rates, _ = _evaluate_terms(scene, params, steps, states[0], np.nan_to_num(consistent))
     terms = terms._replace(rate_by_q=of_rates.rate_by_q, rate_by_qdot=of_rates.rate_by_qdot)
     well = np.logical_and.reduce([np.isfinite(x).reshape(len(x), -1).all(axis=1) for x in (*terms, consistent)])
@@ -136,7 +136,7 @@ def _solve_identities(of: IdentityTerms, qdot, consistent, of_q, units) -> Stead
     if left.size:
         found = np.linalg.lstsq(left, right, rcond=_SINGULAR)[0]
     # Columns that nothing but Ω balances are single directions; others may balance each other.
-    null = decide(left @ found - right, absolute=_CANCELS * len(left) ** 0.5).null if len(left) else np.eye(n)
+    null = truncated_svd(left @ found - right, absolute=_CANCELS * len(left) ** 0.5).null if len(left) else np.eye(n)
     directions = echelon_form((null * (of_q / units)[:, None]).T) * units  # by rows, in the user's units
     pivots = np.array([int(np.argmax(np.abs(row / units))) for row in directions], int)
     cyclic, moves, turns = np.zeros(n, bool), np.zeros((n, n)), np.zeros((n, n, n))

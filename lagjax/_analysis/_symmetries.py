@@ -23,7 +23,7 @@ from lagjax._analysis._potential import absorb_potential_forces
 from lagjax._analysis._random_states import perturb_last_digits, random_states
 from lagjax._analysis._scene_state import SceneState, require_matrices
 from lagjax._analysis._transformations import Fields, fields_of, textbook_symmetries
-from lagjax._equations import decide, echelon_form, span_outside
+from lagjax._equations import echelon_form, span_outside, truncated_svd
 from lagjax._interface import Layout, accept, compile_for_one_call, show_str
 from lagjax._primitives import accepts_singles
 from lagjax._run import Trajectory
@@ -203,7 +203,7 @@ class _SymmetryColumns(NamedTuple):
     def symmetries(self, *columns: np.ndarray) -> np.ndarray:
         """Return an orthonormal basis (K, d) of the null space of these columns."""
         rows = np.concatenate(columns)
-        return decide(rows, absolute=self.threshold * np.sqrt(len(rows))).null
+        return truncated_svd(rows, absolute=self.threshold * np.sqrt(len(rows))).null
 
 
 def _measure_columns(scene: SceneState, fields: Fields, states: FlatState) -> _SymmetryColumns:
@@ -369,7 +369,7 @@ def _independent_fraction(rows: np.ndarray, row: np.ndarray) -> float:
     if not len(rows) or size == 0:
         return float(size > 0)
     lengths = np.linalg.norm(rows, axis=1, keepdims=True)
-    decided = decide(rows / np.where(lengths > 0, lengths, 1), 1e-9)
+    decided = truncated_svd(rows / np.where(lengths > 0, lengths, 1), 1e-9)
     basis = decided.right[:, : int(decided.rank)]
     return float(np.linalg.norm(row - basis @ (basis.T @ row)) / size)
 

@@ -74,7 +74,7 @@ class Event(NamedTuple):
 
     @property
     def ways(self) -> list[bool | None]:
-        """The directions of the functions, in their order."""
+        """The direction of each function of `functions`."""
         return jax.tree.leaves(self.directions, is_leaf=lambda leaf: leaf is None)
 
 
@@ -139,12 +139,12 @@ class Problem:
 
     @functools.cached_property
     def engine_parts(self) -> dict:
-        """The parts that engines have made of it, by name, and use more than once."""
+        """A cache, by name, of the objects that engines build from this problem and use more than once."""
         return {}
 
     @property
     def numbers(self) -> PyTree:
-        """The numbers among the parameters: what can be traced. The rest is part of the program."""
+        """The parameters with None in place of everything that is no number: what JAX may trace."""
         return eqx.filter(self.params, eqx.is_array_like)
 
     @functools.cached_property
@@ -154,12 +154,12 @@ class Problem:
 
     @property
     def is_known(self) -> bool:
-        """True if nothing in it is being traced, so that it can be solved at once."""
+        """True if all times, states and parameters are concrete arrays, so that the problem can be solved at once."""
         return all(map(is_concrete, (self.ts, self.y0, self.vector)))
 
     @property
     def varies(self) -> bool:
-        """True if an input is of the type that `jax.shard_map` gives by default to what differs between devices."""
+        """True if a traced input differs between devices, by the types of `jax.shard_map`."""
         inputs = self.ts, self.y0, *jax.tree.leaves(self.numbers)
         return any(isinstance(x, Tracer) and bool(jax.typeof(x).mat.varying) for x in inputs)
 
@@ -182,7 +182,7 @@ class Problem:
 
 
 def solve_in_doubles(solve: Callable, problem: Problem):
-    """The solution by `solve` in float64, in the precision of the problem."""
+    """The solution by `solve(problem)` computed in float64, rounded to the precision of the problem."""
 
     def solve_numbers(ts, y0, params):
         return solve(replace(problem.double_precision, ts=ts, y0=y0, params=params))
@@ -237,7 +237,7 @@ class Batch(eqx.Module):
         return len(self.y0)
 
     def map_members(self, solve: Callable[..., Any], *more: Any) -> Any:
-        """`solve` under `jax.vmap` over the members; of `more`, that comes behind a problem, each has its own."""
+        """`jax.vmap` of `solve(problem, *more)` over the members; each array of `more` has them as first axis."""
         axes = jax.tree.unflatten(jax.tree.structure(self.params), self.axes)
 
         def solve_member(ts, y0, params, *more):
@@ -247,7 +247,7 @@ class Batch(eqx.Module):
         return jax.vmap(solve_member, in_axes=(of_ts, 0, axes, *[0] * len(more)))(ts, self.y0, self.params, *more)
 
     def map_in_turn(self, solve: Callable[[Problem], "Solution"]) -> "Solution":
-        """`solve` of one member after the other."""
+        """The solutions `solve(problem)` of the members, computed one after the other."""
         structure = jax.tree.structure(self.params)
 
         def solve_member(i):
@@ -380,7 +380,7 @@ def concatenate_leaves(leaves: list, dtype) -> Float[Numbers, " count"]:
 
 
 def stack_members(leaves, axes, size: int, dtype) -> Float[Numbers, "size numbers"]:
-    """The numbers of every member end to end, shape (size, numbers); `axes` are those of the members, leaf by leaf."""
+    """The numbers of `size` members, (size, numbers); `axes` has the member axis of each leaf, None if shared."""
     library = _array_library(*leaves)
     columns = [library.zeros((size, 0), dtype)]
     for leaf, axis in zip(leaves, axes, strict=True):
@@ -393,7 +393,7 @@ def stack_members(leaves, axes, size: int, dtype) -> Float[Numbers, "size number
 
 
 def _member_shape(leaf, axis):
-    """A leaf of one member: zeros of its shape, which cost nothing, or what all members share."""
+    """One member's leaf: zeros of its shape, or the leaf itself if all members share it (axis None)."""
     if axis is None:
         return leaf
     shape = np.shape(leaf)
@@ -465,7 +465,7 @@ def _check_fields(dtype, params, ts, rtol, atol, max_steps, event) -> dict[str, 
 
 
 def explain_tight_rtol(rtol, dtype, least: float) -> str | None:
-    """Why rtol is too small, where it is below `least` units of round-off."""
+    """The sentence that rtol is below `least` units of round-off; None if it is not."""
     eps = float(jnp.finfo(dtype).eps)
     if not is_concrete(rtol) or float(rtol) >= least * eps:
         return None
@@ -504,7 +504,7 @@ _PASSING_ON = ("squeeze", "reshape", "broadcast_in_dim", "copy")
 
 
 def evaluate_condition(function: Callable, *arguments) -> tuple[Any, int]:
-    """The value of an event, and 0; of a comparison the difference of its numbers, and the sign with which it holds."""
+    """An event's value, and 0; of a comparison a > b the number a − b, and the sign for which it holds."""
     leaves, structure = jax.tree.flatten(arguments)
     numbers = [i for i, x in enumerate(leaves) if eqx.is_array_like(x)]  # params may hold words as well
 
@@ -520,7 +520,7 @@ def evaluate_condition(function: Callable, *arguments) -> tuple[Any, int]:
 
 
 def _traced_difference(jaxpr, constants, arguments) -> tuple[Any, int] | None:
-    """The difference of two numbers and its sign, where a jaxpr compares them; None where it does something else."""
+    """a − b and the sign for which a jaxpr's comparison of a and b holds; None if it is no comparison."""
     (out,) = jaxpr.outvars
     equation = next((e for e in jaxpr.eqns if out in e.outvars), None)
     if equation is None:
@@ -543,7 +543,7 @@ def _traced_difference(jaxpr, constants, arguments) -> tuple[Any, int] | None:
 
 
 def signs_of_event(problem: Problem) -> list[int | None]:
-    """For each function of an event the sign of a comparison (`evaluate_condition`), 0 of a number, None of others."""
+    """For each event function the sign for which its comparison holds; 0 for a number, None for others."""
     assert problem.event is not None
     signs: list[int | None] = []
     for function in problem.event.functions:
@@ -559,7 +559,7 @@ def signs_of_event(problem: Problem) -> list[int | None]:
 
 
 def flat_condition(function: Callable, problem: Problem) -> Callable:
-    """An event as a function of the solver's state (2n,), t and the numbers among the parameters."""
+    """The event function as one of the flat state (2n,), t and the numbers among the parameters."""
 
     def condition(y, t, numbers):
         return function(*map(problem.layout.restore, halves(y)), t=t, params=eqx.combine(numbers, problem.params))

@@ -48,7 +48,7 @@ from lagjax._equations._many_states import (
 )
 from lagjax._equations._motion import Motion
 from lagjax._equations._patterns import jacobian_pattern, sparse_jacobian
-from lagjax._equations._rank import Decided, decide, echelon_form, null_space, span_outside
+from lagjax._equations._rank import TruncatedSVD, echelon_form, null_space, span_outside, truncated_svd
 from lagjax._equations._saddle import SaddleElimination, elimination_order
 from lagjax._equations._scales import Scales
 from lagjax._equations._sparse import Band, Blocks, Diagonal, MatrixFree, Sparse, form_of, refine

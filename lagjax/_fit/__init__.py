@@ -280,7 +280,7 @@ class _FitSearch(NamedTuple):
             raise ValueError('method="gradient" goes down from one start: leave `starts` at 1.')
 
     def find_mistake(self, given: list[GivenSystem], left: Unexplained, spent: float) -> list[str]:
-        """The first mistake in records that explains a poor fit, as a sentence; `spent` is the fit's processor time."""
+        """A sentence on the first mistake in records that explains a poor fit; `spent` is its CPU time in seconds."""
         if len(given) > 1 or self.method == "gradient":
             return []
         [system], once = given, self._replace(starts=1, progress=False)

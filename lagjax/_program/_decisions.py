@@ -25,7 +25,7 @@ import numpy as np
 from lagjax._program._cones import list_squares
 from lagjax._program._deciding import PIECEWISE, Deciding, inputs_below
 from lagjax._program._differentiation import gradient_in
-from lagjax._program._features import UP_TO, WITH_FEATURES, Feature, Features, Moving
+from lagjax._program._features import UP_TO, WITH_FEATURES, Feature, Features, MovingNodes
 from lagjax._program._graph import Graph
 from lagjax._program._levels import CLOCK, CONE, FAR, FLOOR, NOTHING, SIGN, TABLE, TRUNC, Decision
 from lagjax._program._operations import COMPARISONS, LOOK_UPS
@@ -61,12 +61,12 @@ class DecidedProgram(NamedTuple):
 
 
 class _SwitchingNumbers:
-    """The decisions of a graph; `moves(x)` tells which nodes vary, and pieces are inputs from position `first` on.
+    """The decisions of a graph, and their switching numbers; `moves(x)` is true for nodes that vary along a motion.
 
     If piece `apart` is set, the program is written twice, once for each value `side` of that piece.
     """
 
-    def __init__(self, graph: Graph, moves: Moving, first: int, apart: int | None):
+    def __init__(self, graph: Graph, moves: MovingNodes, first: int, apart: int | None):
         self.graph, self.moves, self.first, self.apart = graph, moves, first, apart
         self.decisions: list[Decision] = []
         self.pieces: list[int] = []
@@ -156,7 +156,7 @@ class _PieceRewriter:
     def __init__(self, program: Recurrent, size: int, deciding: Deciding, apart: int | None):
         self.program, self.line, self.deciding = program, program.line, deciding
         self.graph = Graph(LARGEST_REWRITING * len(program.line.nodes) + 1000)
-        moves = Moving(self.graph, 2 * size + 1)
+        moves = MovingNodes(self.graph, 2 * size + 1)
         self.switches = _SwitchingNumbers(self.graph, moves, program.size, apart)
         self.features = Features(self.graph, moves)
         self.parts: dict[int, tuple[int, ...]] = {}

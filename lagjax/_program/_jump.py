@@ -45,7 +45,7 @@ _LARGEST_JUMP = 1000  # operations that one may become: a bound for errors
 
 
 class Nesting(NamedTuple):
-    """The layout of a motion of `base` coordinates with its tangents, tangents of all these, and so on.
+    """The layout of a motion of `base` coordinates with tangents, and tangents of all these, and so on.
 
     `directions[k]` is the number of directions at level k. Rows of coordinates follow each other: the motion, its
     tangents, then the tangents of all rows before.
@@ -65,7 +65,7 @@ class Nesting(NamedTuple):
 
     @property
     def disjoint_rows(self) -> list[tuple[int, int, int]]:
-        """Triples of rows (a + b, a, b): derivatives along directions of which none is shared by a and b."""
+        """Triples of rows (a + b, a, b), where a and b are derivatives without a common direction."""
         counts, found = [1 + count for count in self.directions], []
         place = functools.partial(np.ravel_multi_index, dims=counts, order="F")
         for index in itertools.product(*map(range, counts)):
@@ -146,7 +146,7 @@ class Jump(NamedTuple):
 
 
 def with_borders_of_tangents(borders: Borders, size: int, directions: int, member: int) -> Borders:
-    """The borders of a motion together with its tangents along `directions` directions D; between borders it is smooth.
+    """The borders of a motion with its tangents along D = `directions` directions; tangents have no further borders.
 
     The inputs q, q̇ and parameters have 1 + D rows, the motion and then one for each direction, and so have the
     accelerations. `member` is the number of parameters of a member, some of which are read by look-ups only.
@@ -191,7 +191,7 @@ def row_places(n: int, numbers: int, rows: int, row: int) -> list[int]:
 
 
 def _table_of_row(shift: int) -> TangentTable:
-    """A map from a table of the motion to that of a row of tangents, whose parameters come `shift` positions later."""
+    """A map from tables of the motion to those of a row of tangents, `shift` positions later."""
     return lambda table: shift_look_up(table, shift)
 
 
@@ -259,7 +259,7 @@ class _Jets:
 
 
 class _JumpBuilder:
-    """The construction of the jump of state and tangents at a border in one graph, in the arithmetic of jets."""
+    """Builds the jump of state and tangents at a border, in the arithmetic of jets, as one graph."""
 
     def __init__(self, borders: Borders, size: int, directions: tuple[int, ...], member: int, over_steps: bool):
         program = borders.program
@@ -327,6 +327,7 @@ class _JumpBuilder:
         return [*place[self.n : 2 * self.n], *acceleration, one, *[none] * self.numbers]
 
     def _flow_jets(self, place: list[Jet], pieces: Sequence[int], delay: Jet) -> list[Jet]:
+        """The moving inputs after the flow over the time `delay`, by one Runge–Kutta step, as jets."""
         jets, rates, stages = self.jets, [], _STAGES[len(self.jets.directions) - 1]
         for weights in stages:
             here = place
@@ -351,6 +352,7 @@ class _JumpBuilder:
 
     @property
     def _lower_jets(self) -> int:
+        """The number of lower rows: those without a derivative along the last level's directions."""
         return self.jets.rows // (1 + self.jets.directions[-1])
 
     def build(self) -> Jump:

@@ -568,14 +568,14 @@ def run_in_doubles(motion: Callable, problem: Problem, *more) -> Any:
 
 
 def run_single(follow: Callable, problem: Problem, *more) -> Any:
-    """`run_rows` for the one member of a problem, without the axis of members."""
+    """The result of `run_rows` for a problem of one member, without the axis of members."""
     rows = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
     found = run_rows(follow, problem, *rows, *more)
     return jax.tree.map(lambda x: np.asarray(x)[0], found)
 
 
 def run_rows(follow: Callable, member: Problem, ts, y0, vectors, *more) -> Any:
-    """`follow(layout, params, ts, y0, vectors, *more)` of members with concrete numbers, in their precision.
+    """`integrate(layout, params, ts, y0, vectors, *more)` for members with concrete numbers, in their precision.
 
     They have `ts` (N, T) or (1, T), `y0` (N, 2n), `vectors` (N, P) or (1, P); the rest is that of one `member`.
     """

@@ -129,7 +129,7 @@ class Sweep:
         for text in damaged.values():
             warnings.warn(f"{self.store}: {text}. Run the sweep again: it computes them again.", stacklevel=2)
         result = data[RESULT.name].load()  # attributes and coordinates stay
-        for unit in set(range(store.grid(spec).units)) & set(damaged):
+        for unit in set(range(store.grid(spec).unit_count)) & set(damaged):
             result.values[store.grid(spec).box(unit)] = NOT_DONE
         return data.assign({RESULT.name: result})
 

@@ -52,7 +52,7 @@ class KeptResults(NamedTuple):
 
 
 class Batches:
-    """Computes batches of one sweep; what it compiles it keeps."""
+    """Simulates batches of a sweep's members, and keeps the compiled programs."""
 
     def __init__(self, description: Description, conserves: bool):
         self.description, self.conserves = description, conserves
@@ -102,7 +102,7 @@ class Batches:
             return sum(x.nbytes for x in (row or {}).values())
 
     def _compute_motions(self, points: dict[str, np.ndarray]) -> tuple["_BatchMotions", dict[int, str], dict[int, str]]:
-        """The motions, and complaints by members: about their starts, and about times that are none."""
+        """The motions at points (B,), and {member: sentence} on failed starts, then on wrong output times."""
         description, complaints, wrong = self.description, {}, {}
         starts = self._starts.items()
         values = {role: f(points, complaints) if f else getattr(description, role) for role, f in starts}
@@ -116,7 +116,7 @@ class Batches:
         return _BatchMotions(run, (of_run, crossings), for_members), complaints, wrong
 
     def _keep_results(self, motions: "_BatchMotions") -> _Kept:
-        """The result of `keep` for each member, the change of its energy, and the members for which `keep` raised."""
+        """What `keep` returns for every member, |h − h₀| (B,), and {member: sentence} for those where it raised."""
         if "keep" not in self.slow:
             try:
                 kept, drift = self._keep_all(motions.arrays, motions.params)
@@ -135,7 +135,7 @@ class Batches:
     # ---- compiled for all members ----
 
     def _vectorize_start(self, role: str, function: Callable) -> Callable:
-        """`function(point)` for points (B,) of all members; why it raised for some is added to `complaints`."""
+        """`start(points, complaints)`: `function` at points (B,); members that raise get a complaint."""
         compiled = jax.jit(jax.vmap(function))
 
         def start(points, complaints):
@@ -160,6 +160,7 @@ class Batches:
         return kept
 
     def _member_trajectory(self, arrays: dict, params: PyTree) -> Trajectory:
+        """The `Trajectory` of one member, as `keep` takes it, from its arrays."""
         scene, code, ts = self.description.system, arrays["code"], arrays.get("ts", self.description.ts)
         modes = dict(scene.modes) if isinstance(scene, Hybrid) else None
         return Trajectory.from_fields(
@@ -182,7 +183,7 @@ class Batches:
     # ---- member by member ----
 
     def _keep_one_by_one(self, motions: "_BatchMotions") -> tuple[dict[str, np.ndarray], dict[int, str]]:
-        """The result of `keep` for each member, one after the other; and the complaints about these results."""
+        """What `keep` returns, called member by member, (B, …) by name; and {member: sentence} where it failed."""
         rows, errors = self._call_keep(motions)
         if not self.quantities and not any(rows):
             raise errors[0]  # at the first look, of all members
@@ -198,6 +199,7 @@ class Batches:
         return kept, complaints
 
     def _call_keep(self, motions: "_BatchMotions") -> tuple[list[dict[str, np.ndarray] | None], dict[int, Exception]]:
+        """The dict that `keep` returns for each member, None where it raised; and {member: exception}."""
         of_all = jax.tree.map(np.asarray, (*motions.arrays, motions.params))
         keep_member = self._keep_member if "keep" in self.slow else self._keep_one
 
@@ -209,7 +211,7 @@ class Batches:
 
 
 class _BatchMotions(NamedTuple):
-    """Motions of a batch, the arrays of B members in these and in their crossings, and params that differ by member."""
+    """The motions of a batch; the arrays of B members (trajectories, crossings); params that differ by member."""
 
     run: Trajectory
     arrays: tuple
@@ -217,7 +219,7 @@ class _BatchMotions(NamedTuple):
 
 
 def _replace_bad_times(ts: np.ndarray, complaints: dict[int, str]) -> tuple[np.ndarray, dict[int, str]]:
-    """Times (B, T), in place of those that cannot be followed any others; and what is wrong with these, by members."""
+    """Times (B, T) with invalid rows replaced by a valid one; and {member: sentence} for those."""
     steps = np.diff(ts, axis=1)
     is_sound: Any = np.isfinite(ts).all(axis=1) & ((steps > 0).all(axis=1) | (steps < 0).all(axis=1))
     reason = "ts returned times that are not finite, or neither increase nor decrease"
@@ -227,7 +229,7 @@ def _replace_bad_times(ts: np.ndarray, complaints: dict[int, str]) -> tuple[np.n
 
 
 def _start_one_by_one(role: str, function: Callable, points: dict[str, np.ndarray], complaints: dict[int, str]):
-    """`function(point)` called with numbers for each member; NaN, and the complaint, where it raises."""
+    """`function(point)` member by member; NaN where it raises, with a sentence in `complaints`."""
 
     def start(k: int) -> PyTree:
         return jax.tree.map(lambda x: np.asarray(x, float), function({name: float(x[k]) for name, x in points.items()}))
@@ -242,7 +244,7 @@ def _start_one_by_one(role: str, function: Callable, points: dict[str, np.ndarra
 
 
 def _call_each(function: Callable[[int], Any], count: int) -> tuple[list[Any], dict[int, Exception]]:
-    """The results of a user's function for each member, None where it raised: that one is lost; and the exceptions."""
+    """The results of `function(k)` for k < count, None where it raised; and {k: exception}."""
     rows, errors = [None] * count, {}
     for k in range(count):
         try:
@@ -253,7 +255,7 @@ def _call_each(function: Callable[[int], Any], count: int) -> tuple[list[Any], d
 
 
 def _common_quantities(rows: list[dict[str, np.ndarray]]) -> list[Quantity]:
-    """The quantities of the first member, each of the type that holds what all keep (1 and 1.5 are floats), if any."""
+    """The kept quantities, named as by the first member, each with the dtype that holds the values of all."""
     common = []
     for name, first in rows[0].items():
         dtype = first.dtype
@@ -267,13 +269,14 @@ _KEPT = ("q", "qdot", "end", "mode", "transitions", "impacts", "contacts", "cont
 
 
 def _result_arrays(run: Trajectory) -> dict[str, Any]:
+    """The fields of a batch's trajectory that `keep` may read, by name, as arrays with the members first."""
     fields = {name: getattr(run, name) for name in _KEPT}
     fields |= {name: _fill_record(fields[name]) for name in ("impacts", "contact_changes") if fields[name] is not None}
     return fields | {"code": run.result._value, "stats": {k: x for k, x in run.stats.items() if jnp.ndim(x)}}
 
 
 def _fill_record(record: Any) -> Any:
-    """The `Impacts` or `ContactChanges` of a batch, (B, N, …), with the room that all batches have."""
+    """`Impacts` or `ContactChanges` (B, N, …) padded to N = `MOST_CONTACT_CHANGES`, so that batches agree."""
 
     def fill(x):
         widths = [(0, 0), (0, MOST_CONTACT_CHANGES - x.shape[1]), *[(0, 0)] * (jnp.ndim(x) - 2)]
@@ -284,6 +287,7 @@ def _fill_record(record: Any) -> Any:
 
 
 def _explain_mismatch(expected: list[Quantity], row: dict[str, np.ndarray]) -> str | None:
+    """A sentence if a member's kept values differ in name, shape or type from the expected ones; else None."""
     names = [q.name for q in expected]
     if names != list(row):
         return f"keep returned {list(row)}, of other members {names}"
@@ -325,7 +329,7 @@ def _first_line(error: BaseException) -> str:
 
 
 def _describe_error(error: Exception) -> str:
-    """The type and the first line of an error; of one that a callback raised, its line in all that XLA says."""
+    """The type and first line of an error; for one raised in a callback, its line within XLA's message."""
     lines = (line.strip() for line in reversed(str(error).split("\n")))
     said = next((line for line in lines if _RAISED.match(line)), None)
     return f"{type(error).__name__}: {_first_line(error)}" if said is None else said[:200]
@@ -371,7 +375,7 @@ def run_batch(description: Description, values: dict[str, PyTree], ts, axes: tup
 
 
 def _find_crossings(batch: Batch, sections: Sections) -> tuple[Solution, FoundCrossings]:
-    """The motions from the first to the last time, and the crossings of G sections, each with that axis in front."""
+    """The motions of a batch, and the crossings of G sections, (G, B, …)."""
     section = sections.named_functions() if sections.names else sections.functions[0]
     surfaces = surfaces_in(batch.member, sections_of(section)[1], sections.directions, sections.names)
     problem = dataclasses.replace(batch.member, guards=surfaces.guards(notes=True))

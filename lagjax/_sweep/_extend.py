@@ -68,7 +68,7 @@ def copy_members(old: Files, new: Files) -> None:
             stacklevel=4,
         )
         return
-    for unit in range(grid.units):
+    for unit in range(grid.unit_count):
         box = [places_in(part) for places_in, part in zip(places, grid.box(unit), strict=True)]
         inside = [np.flatnonzero(x >= 0) for x in box]
         if not all(len(x) for x in inside):
@@ -106,7 +106,7 @@ def _read_members(old: Files, spec: dict, places: list[np.ndarray]) -> dict[str,
 
 
 class LaterEnd(NamedTuple):
-    """The last states in a store, from which motions continue: their name there, and the names of their leaves."""
+    """The last states in another store, where motions continue: their name there, and the names of their leaves."""
 
     store: Files
     end: str
@@ -124,7 +124,7 @@ class LaterEnd(NamedTuple):
     def copy_starts(self, new: Files) -> None:
         """Write the states as starts of the members of a new store; members that ended keep their result."""
         grid = new.grid(new.spec())
-        for unit in range(grid.units):
+        for unit in range(grid.unit_count):
             states, result = self.read(grid.box(unit))
             ended = np.flatnonzero(result != SUCCESSFUL)
             new.write_copied(unit, Copied(ended, {RESULT.name: result[ended]}, states))
@@ -149,7 +149,7 @@ def later_end_of(other: Files, axes: tuple[Axis, ...], description: Description)
     if lines := differences(spec, compared_entries(axes, description), ("axes", "x64", "scene"), MOTION):
         said = f"{other.path} has motions of another description, which cannot continue. What differs:"
         raise ValueError("\n".join([said, *lines]))
-    if missing := other.grid(spec).units - len(other.finished_units()):
+    if missing := other.grid(spec).unit_count - len(other.finished_units()):
         raise ValueError(f"{other.path}: {missing} units are not done; motions can continue when they are.")
     names = [name for axis in spec["axes"] for name in axis["names"]]
     shapes, state = {x.name: x.shape for x in other.quantities(spec)}, description.shapes(names)[:2]

@@ -288,7 +288,7 @@ class Files:
         """Mark a unit as not done, also for those who read `result`."""
         with self.explain_errors(f"unit {unit} is damaged, and stays so"):
             (self.job / "done" / f"{unit}.json").unlink(missing_ok=True)
-            if unit < self.grid(spec).units:
+            if unit < self.grid(spec).unit_count:
                 self.chunk_file(self.grid(spec), unit, RESULT).unlink(missing_ok=True)
 
     def find_damage(self, spec: dict, units: Iterable[int], whole: bool = False) -> dict[int, str]:
@@ -302,8 +302,8 @@ class Files:
 
     def _describe_damage(self, spec: dict, whole: bool, unit: int) -> str | None:
         grid = self.grid(spec)
-        if unit >= grid.units:
-            return f"unit {unit}: there are but {grid.units} units"
+        if unit >= grid.unit_count:
+            return f"unit {unit}: there are but {grid.unit_count} units"
         try:
             hashes = self.record(unit)["sha256"]
         except (ValueError, OSError):

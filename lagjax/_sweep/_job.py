@@ -150,7 +150,7 @@ class Unit(NamedTuple):
 
 def split_unit(job: Job, unit: int) -> list[tuple[np.ndarray, int]]:
     """Return the batches of a unit: the members in each, all of one length, and how many are not copies."""
-    members = np.setdiff1d(np.arange(job.grid.size(unit)), job.store.read_copied(unit).members)
+    members = np.setdiff1d(np.arange(job.grid.unit_size(unit)), job.store.read_copied(unit).members)
     if not members.size:
         return []
     batch = math.ceil(len(members) / math.ceil(len(members) / job.spec["batch"]))
@@ -167,7 +167,7 @@ def unit_points(job: Job, unit: int) -> Callable[[np.ndarray], dict[str, np.ndar
 
 def compute_unit(job: Job, unit: int) -> Unit:
     began, spent = time.monotonic(), time.process_time()
-    size, points, copied = job.grid.size(unit), unit_points(job, unit), job.store.read_copied(unit)
+    size, points, copied = job.grid.unit_size(unit), unit_points(job, unit), job.store.read_copied(unit)
     drifts, complaints = np.full(size, np.nan), {}
     values = {q.name: np.full((size, *q.shape), q.filling, q.dtype) for q in (*job.batches.quantities, RESULT)}
     result = values[RESULT.name]
@@ -195,7 +195,7 @@ def compute_unit(job: Job, unit: int) -> Unit:
 
 
 def unit_record(grid: Grid, unit: int, result: np.ndarray, engine: str, complaints: dict[int, str]) -> dict:
-    """Return the record of a unit: its `result`s (m,) counted by name, and the first failed members."""
+    """Return the record of a unit: counts of its `result`s (m,) by name, and the first failed members."""
     codes, failed = np.unique(result, return_counts=True), np.flatnonzero(~np.isin(result, ENDED_WELL))[:_NAMED]
     results = {result_name(int(code)): int(count) for code, count in zip(*codes, strict=True)}
     rows = zip(grid.numbers(unit, failed), result[failed], failed, strict=True)

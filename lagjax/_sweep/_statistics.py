@@ -97,7 +97,7 @@ class Summary(NamedTuple):
 
 
 def unit_statistics(how: Statistics, values: np.ndarray, ok: np.ndarray, members: np.ndarray) -> Partial:
-    """Return the statistics of a unit: `values` (m, …) of its members, `ok` of each, and their numbers (m,)."""
+    """Return the statistics of a unit from `values` (m, …), flags `ok` (m,), and the members' numbers (m,)."""
     columns = np.ascontiguousarray(values.reshape(len(values), -1).astype(float).T)
     rows = [_summarize_column(how, c, x, ok & np.isfinite(x), members) for c, x in enumerate(columns)]
     *fields, sketches = zip(*rows, strict=True)
@@ -159,6 +159,7 @@ def merge_statistics(one: Partial | None, two: Partial) -> Partial:
 
 
 def summarize(how: Statistics, total: Partial, shape: tuple[int, ...]) -> Summary:
+    """Return the statistics `how` asks for, in the `shape` of the quantity, from the accumulated `total`."""
     empty = total.count == 0
     with np.errstate(invalid="ignore", divide="ignore"):
         variance = np.where(total.count > 1, total.square / (total.count - 1), np.nan)

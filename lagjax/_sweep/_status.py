@@ -101,9 +101,9 @@ def read_status(store: Files) -> Status:
     members, rate = sum(r["members"] for r in records), _members_per_second(store, done, records)
     slow = {name: why for record in records for name, why in record["slow"].items()}
     return Status(
-        store=str(store.path), done=members, members=grid.members, units_done=len(done), units=grid.units,
+        store=str(store.path), done=members, members=grid.member_count, units_done=len(done), units=grid.unit_count,
         rate=rate,
-        left=None if rate is None else (grid.members - members) / rate, results=dict(results), failures=failures,
+        left=None if rate is None else (grid.member_count - members) / rate, results=dict(results), failures=failures,
         drift=None if worst is None else (worst[0], worst[1], read_point(store, spec, worst[1])), slow=slow,
         cpus=tuple(dict.fromkeys(record["cpu"] for record in records if "cpu" in record)), damaged=damaged,
     )  # fmt: skip
@@ -137,7 +137,7 @@ class Progress:
     """Prints the progress on one line of stderr, over and over: done, rate, failures, time left."""
 
     def __init__(self, store: Files, spec: dict, shown: bool):
-        self.store, self.shown, self.members = store, shown, store.grid(spec).members
+        self.store, self.shown, self.members = store, shown, store.grid(spec).member_count
         self._begun, self._counted, self._results, self._last = None, set(), Counter(), 0.0
 
     def __call__(self) -> None:

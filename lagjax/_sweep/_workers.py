@@ -42,9 +42,9 @@ def units_to_compute(job: Job, part: slice) -> list[int]:
 
     A finished store may be on a read-only disk.
     """
-    store, chosen = job.store, set(range(job.grid.units)[part])
+    store, chosen = job.store, set(range(job.grid.unit_count)[part])
     store.require_arrays(job.spec)
-    finished = {unit for unit in store.finished_units() if unit in chosen or unit >= job.grid.units}
+    finished = {unit for unit in store.finished_units() if unit in chosen or unit >= job.grid.unit_count}
     damaged = store.find_damage(job.spec, finished, whole=True)
     for unit in damaged:
         store.mark_undone(job.spec, unit)
@@ -59,7 +59,7 @@ def units_to_compute(job: Job, part: slice) -> list[int]:
 
 
 def compute_units(job: Job, units: list[int], notify: Notify = lambda: None) -> int:
-    """Compute and write these units in this process; return how many were not already done by another."""
+    """Compute and write these units in this process; return the number that no other worker had written."""
     count = 0
     with set_precision(bool(job.spec["x64"])):
         for unit in units:
@@ -100,7 +100,7 @@ def submit_units(job: Job, units: list[int], executor: Any, notify: Notify) -> N
             notify()
     except BrokenExecutor as death:  # of one of the first units that are not done: workers take them in order
         left = [unit for unit in units if not job.store.has_finished(unit)][: getattr(executor, "_max_workers", 1)]
-        ends = [job.grid.numbers(unit, np.array([0, job.grid.size(unit) - 1])) for unit in left]
+        ends = [job.grid.numbers(unit, np.array([0, job.grid.unit_size(unit) - 1])) for unit in left]
         which = ", or ".join(f"{unit} (members {a} to {b})" for unit, (a, b) in zip(left, ends, strict=True))
         raise RuntimeError(
             f"{path}: a worker process ended over unit {which}. What is done is kept. Look at these members with "

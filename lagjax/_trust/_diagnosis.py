@@ -71,7 +71,7 @@ _AT_CORNER = (
 
 
 class MotionEnd(NamedTuple):
-    """The first and the last state of one motion, in NumPy: `y` (2n,) at `t`, of times `t_first` … `t_last`."""
+    """The first and the last state (2n,) of one motion in NumPy, with their times, and its parameters."""
 
     code: int
     t: float
@@ -337,7 +337,7 @@ def _describe_runaway(derivation: Derivation, ended: MotionEnd) -> int | None:
 
 
 def _escape_place(system: System, derivation: Derivation, params, ended: MotionEnd, place: int) -> str:
-    """Return a sentence on where a coordinate diverges to: a pole of an operation in the force or L, or infinity."""
+    """Return a sentence on where coordinate number `place` diverges to: a pole of the force or L, or infinity."""
     functions, arguments = _short_functions(system, derivation.layout, params, ended)
     pole = next((near for function in functions for near in find_poles(function, *arguments)), None)
     name, (q, v), (q_first, v_first) = derivation.layout.names[place], halves(ended.y), halves(ended.y_first)

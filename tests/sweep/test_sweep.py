@@ -214,7 +214,7 @@ def test_statistics_leave_out_what_is_not_finite():
 @pytest.mark.parametrize("size", [1, 4, 60, 10**6])
 def test_units_tile_the_members_in_order(shape, size):
     grid = Grid.from_shape(shape, size)
-    numbers = [grid.numbers(unit, np.arange(grid.size(unit))) for unit in range(grid.units)]
+    numbers = [grid.numbers(unit, np.arange(grid.unit_size(unit))) for unit in range(grid.unit_count)]
     np.testing.assert_array_equal(np.concatenate(numbers), np.arange(np.prod(shape)))
     assert max(map(len, numbers)) <= size
 
@@ -223,7 +223,7 @@ def test_a_hundred_million_members_are_no_list(monkeypatch):
     monkeypatch.setattr(designs, "SLICE", 1000)
     over = {"a": np.linspace(0, 1, 10_000), "b": designs.random(10_000)}
     grid = Grid.from_shape(tuple(axis.size for axis in axes_of(over)), 10**6)
-    assert grid.members == 10**8 and grid.units == 100 and grid.box(99)[0] == slice(9900, 10_000)
+    assert grid.member_count == 10**8 and grid.unit_count == 100 and grid.box(99)[0] == slice(9900, 10_000)
     (axis,) = axes_of({("x", "y"): designs.random(10**8, seed=3)})
     start, first = next(axis.pieces())
     assert start == 0 and len(first) == 1000

@@ -119,7 +119,7 @@ class Arcs:
         return self.flow.run(times, y0, self.numbers[None], self.tolerances)
 
     def divide_evenly(self, span: np.ndarray, y0: np.ndarray, count: int) -> np.ndarray:
-        """Divide spans (R,) into `count` parts with about equally many steps each: fractions (R, count + 1).
+        """Fractions (R, count + 1) that divide each span (R,) into parts with about equally many steps.
 
         A part begins where the state is small and changes slowly, if there is such a time nearby.
         """

@@ -17,7 +17,7 @@ import numpy as np
 
 
 class EliminationRound(NamedTuple):
-    """The eliminated unknowns in terms of the others: `of_left`, `of_right` (B, K/2, s, s), `of_z` (B, K/2, s, c)."""
+    """Eliminated unknowns by the others: `of_left`, `of_right` (B, K/2, s, s), `of_z` (B, K/2, s, c)."""
 
     of_left: np.ndarray
     of_right: np.ndarray

@@ -26,7 +26,7 @@ from lagjax._analysis.orbits._arc_motions import Arcs
 from lagjax._analysis.orbits._condensation import Condensed, condense_chain
 from lagjax._analysis.orbits._orbit import CLOSED, MOST_ARCS
 from lagjax._analysis.orbits._shooting import Chain, Closing
-from lagjax._equations import decide, span_outside
+from lagjax._equations import span_outside, truncated_svd
 
 _TRIALS = 8  # of Newton's method: beyond, the step along the family was too long
 # A step is repeated at half its length beyond these: the ratio of the second correction to the first, the first one in
@@ -101,7 +101,7 @@ class Follower:
         return Closing.from_arcs(self.arcs.with_numbers(numbers))
 
     def orbit_point(self, y, period, parts, numbers) -> FamilyPoint:
-        """Return the chain through these states, (1, K, 2n), and its closing equations."""
+        """Return the orbit through states y (1, K, 2n), with its closing equations."""
         closing = self.closing_conditions(numbers)
         chain = _shooting.integrate_chain(closing, y, period, parts, self.units)
         columns = [chain.rate[..., None] * np.diff(chain.parts)[..., None, None]] if self.period_is_free else []
@@ -185,7 +185,7 @@ def tangent_at(
     the tangent is then the direction nearest to `before`.
     """
     states = point.matrix.shape[0]
-    whole, still = decide(point.matrix, _shooting.RANK), decide(point.matrix[:, :states], _shooting.RANK)
+    whole, still = truncated_svd(point.matrix, _shooting.RANK), truncated_svd(point.matrix[:, :states], _shooting.RANK)
     slope, count, rank = follower.ascent(point), states - int(still.rank), int(whole.rank)
     if before is not None:  # a rank that falls short of itself in passing a branch point
         at_least = whole.values[before.rank - 1] > _ROUNDING * whole.values[0]
@@ -195,7 +195,7 @@ def tangent_at(
     symmetries[:states] = still.right[:, states - count :]
     if before is None:  # that in which the value rises is no symmetry
         along = symmetries.T @ slope
-        symmetries = symmetries @ decide(along[None], absolute=1e-6 * float(np.linalg.norm(slope))).null
+        symmetries = symmetries @ truncated_svd(along[None], absolute=1e-6 * float(np.linalg.norm(slope))).null
     across = span_outside(whole.right[:, rank - left_out :], symmetries)
     vector = across @ (across.T @ (slope if before is None else before.vector))
     length = np.linalg.norm(vector)
@@ -228,7 +228,7 @@ def correct_orbit(
             return point, np.array(sizes)
         before = closure
         matrix, right = np.concatenate([point.matrix, across.vector[None]]), np.append(point.right, 0.0)
-        change = -decide(matrix)._replace(rank=np.array(across.rank + 1 - left_out)).least_norm(right)
+        change = -truncated_svd(matrix)._replace(rank=np.array(across.rank + 1 - left_out)).least_norm(right)
         sizes.append(np.linalg.norm(change))
         point = follower.apply_change(point, change, 1.0)
     return (point, np.array(sizes)) if point.closed(CLOSED) else None

@@ -34,7 +34,7 @@ from lagjax._analysis.orbits._continuation import (
 )
 from lagjax._analysis.orbits._floquet import passage_determinant, reduce_arcs
 from lagjax._analysis.orbits._orbit import RTOL, FlatOrbits, Orbit, arc_counts, assess_orbits, restore_orbits
-from lagjax._equations import decide, span_outside
+from lagjax._equations import span_outside, truncated_svd
 from lagjax._interface import Layout, halves, labelled_leaves, require_budget, require_tolerance
 from lagjax._primitives import accepts_singles
 from lagjax._scene import System
@@ -165,6 +165,7 @@ def _build_member(follower: Follower, point: FamilyPoint, tangent: FamilyTangent
 
 
 def _follow_family(follower: Follower, y0, period, step: float, count: int) -> tuple[list[_Member], str]:
+    """Return the orbits of a family, at most `count`, from one of them, and the sentence on its end."""
     point, shortest, until = _first_point(follower, y0, period, follower.arcs.numbers), _SHORTEST * step, follower.until
     if until is not None:
         follower.of_value = abs(until - follower.value(point)) or 1.0
@@ -376,8 +377,8 @@ def _branching_orbit(follower: Follower, here: FamilyPoint, before: FamilyTangen
     Symmetries are known from a neighbour: at the branch point singular values do not distinguish them.
     """
     states, count = here.matrix.shape[0], before.symmetries.shape[1]
-    still = decide(here.matrix[:, :states]).right[:, states - count - 1 :]
-    null = decide(here.matrix).right[:, before.rank - 1 :]
+    still = truncated_svd(here.matrix[:, :states]).right[:, states - count - 1 :]
+    null = truncated_svd(here.matrix).right[:, before.rank - 1 :]
     known = np.zeros((null.shape[0], count + 1))
     known[:states, :count] = still @ (still.T @ before.symmetries[:states])
     known[:, count] = null @ (null.T @ before.vector)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._equations import decide
+from lagjax._equations import truncated_svd
 
 # |multiplier| − 1 above this makes an orbit unstable. Multipliers on the unit circle come out within 1e-9 of it, where
 # two of them meet within the square root of their accuracy, 1e-6.
@@ -50,8 +50,8 @@ def _quotient_basis(null: np.ndarray, of_transpose: np.ndarray) -> np.ndarray:
     """Return an orthonormal basis (2n, m) of the part of ker ℓ that is orthogonal to W ∩ ker ℓ."""
     w, ell = np.linalg.qr(null)[0], np.linalg.qr(of_transpose)[0]
     # Directions of W that ℓ does not see; those it sees are simple multipliers, outside of ker ℓ.
-    inside = w @ decide(ell.T @ w, absolute=_SEEN).null
-    return decide(np.concatenate([ell, inside], axis=1).T).null
+    inside = w @ truncated_svd(ell.T @ w, absolute=_SEEN).null
+    return truncated_svd(np.concatenate([ell, inside], axis=1).T).null
 
 
 _SEEN = 1e-5  # the cosine of W and ℓ that tells a simple multiplier 1 from a Jordan block

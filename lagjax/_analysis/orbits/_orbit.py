@@ -12,7 +12,7 @@ from lagjax._analysis.orbits import _shooting
 from lagjax._analysis.orbits._arc_motions import Arcs, check_starts
 from lagjax._analysis.orbits._floquet import UNCERTAIN, UNSTABLE, multipliers_of, pairing_error, reduce_arcs
 from lagjax._analysis.orbits._shooting import Chain, Closing
-from lagjax._equations import decide, singular_threshold
+from lagjax._equations import singular_threshold, truncated_svd
 from lagjax._interface import SUCCESSFUL, Layout, SimulationError, halves, require_finite, require_flag, require_number
 from lagjax._primitives import accepts_singles
 from lagjax._run.hybrid import Scene
@@ -172,7 +172,7 @@ def _closing_conditions(arcs: Arcs, energy, image) -> Closing:
     terms = np.abs(matrix) @ np.abs(somewhere) + np.abs(shift)
     if not (np.abs(flat(somewhere) - matrix @ somewhere - shift) <= 1e-12 * terms).all():
         raise ValueError("image must be affine in (q, qdot): a linear map and a shift. Use coordinates in which it is.")
-    if decide(matrix, singular_threshold(states, float)).rank < states:
+    if truncated_svd(matrix, singular_threshold(states, float)).rank < states:
         raise ValueError("image must be invertible: it sends different states to the same one.")
     return plain._replace(matrix=matrix, shift=shift)
 
@@ -214,7 +214,7 @@ def find_orbits(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrb
 
 
 def arc_counts(arcs: Arcs, y0, period) -> np.ndarray:
-    """Return the number of arcs of each orbit, a power of two, from the number of steps of its guess."""
+    """Return the number of arcs into which each orbit is divided, a power of two, from the steps of its guess."""
     if arcs.jumping:  # a state between does not tell the mode
         return np.ones(len(period), int)
     run = arcs.integrate(np.stack([np.zeros(len(period)), period], axis=1), y0)

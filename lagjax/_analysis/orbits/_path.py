@@ -27,7 +27,7 @@ from jaxtyping import PyTree
 from lagjax._analysis.orbits._arc_motions import Arcs, Units
 from lagjax._analysis.orbits._shooting import Chain, Closing, close_chains, condense_equations
 from lagjax._engine import concatenate_leaves
-from lagjax._equations import decide
+from lagjax._equations import truncated_svd
 from lagjax._interface import Layout, SimulationError, as_arrays, halves, require_finite, require_flag, require_number
 from lagjax._primitives import accepts_singles
 from lagjax._run import Trajectory, simulate
@@ -292,7 +292,9 @@ def _conjugate_times(arcs: Arcs, y: np.ndarray, times: np.ndarray, units: Units)
                 found.append(_locate_conjugate_time(arcs, start, ts[0], ts[j], ts[j + 1], frame, frames[j], nth, units))
         frame = frames[-1]
     found = np.sort(np.array(found))
-    singular = decide(frame[:n], absolute=_AT_END).rank < n  # the first rows B of an orthonormal plane, to rounding
+    singular = (
+        truncated_svd(frame[:n], absolute=_AT_END).rank < n
+    )  # the first rows B of an orthonormal plane, to rounding
     at_end = bool((found > times[-1] - _AT_END * duration).any() or singular)
     return found[found <= times[-1] - _AT_END * duration], at_end
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from lagjax._analysis.orbits._arc_motions import Arcs, Units
 from lagjax._analysis.orbits._condensation import Condensed, condense_chain
-from lagjax._equations import Decided, decide, singular_threshold
+from lagjax._equations import TruncatedSVD, singular_threshold, truncated_svd
 
 Members = TypeVar("Members")
 
@@ -39,7 +39,7 @@ _ENOUGH = 8e-15  # of the size of the state: round-off, below which trials canno
 
 
 class Closing(NamedTuple):
-    """The conditions on both ends of a chain. An orbit has S y = `matrix` y + `shift`, and an energy if given.
+    """The conditions on a chain. Those of an orbit: S y = `matrix` y + `shift`, and an energy if given.
 
     A path has the given positions: `q_end` (n,), and the one it begins with, at the time `t_first`.
     """
@@ -61,7 +61,7 @@ class Closing(NamedTuple):
         return self.arcs.driven or self.q_end is not None
 
     def free_directions(self) -> tuple[np.ndarray, np.ndarray]:
-        """E and F (2n, 2n): the unknowns u (2n,) change the first state by E u and the last by F u."""
+        """E and F (2n, 2n): unknowns u (2n,) change the first state by E u and the last one by F u."""
         whole, n = np.eye(2 * self.arcs.size), self.arcs.size
         if self.q_end is None:
             return whole, whole
@@ -192,7 +192,7 @@ class NewtonEquations(NamedTuple):
     """
 
     condensed: Condensed
-    decided: Decided
+    decided: TruncatedSVD
     right: np.ndarray
 
 
@@ -213,7 +213,7 @@ def condense_equations(closing: Closing, chain: Chain) -> NewtonEquations:
         threshold = np.clip(_PER_DEFECT * chain.merit() / np.maximum(chain.size(), 1e-300), RANK, _LARGEST_RANK)
     else:
         threshold = singular_threshold(chain.y[0].size, float)
-    return NewtonEquations(condensed, decide(matrix, threshold), right)
+    return NewtonEquations(condensed, truncated_svd(matrix, threshold), right)
 
 
 def newton_correction(closing: Closing, chain: Chain) -> tuple[np.ndarray, np.ndarray]:
@@ -286,11 +286,11 @@ def find_null_spaces(chain: Chain, most: int | None = None) -> list[Symmetries]:
     return found
 
 
-def _closure_null_vectors(growth: np.ndarray) -> tuple[Decided, np.ndarray]:
+def _closure_null_vectors(growth: np.ndarray) -> tuple[TruncatedSVD, np.ndarray]:
     """Return the rank of A + B of closed chains, and the right singular vectors at all states, (B, K, 2n, 2n)."""
     chains, count, states, _ = growth.shape
     condensed = condense_chain(growth, np.zeros((chains, count, states, 0)))
-    rank = decide(condensed.first + condensed.last, RANK)
+    rank = truncated_svd(condensed.first + condensed.last, RANK)
     return rank, condensed.expand_solution(rank.right, rank.right, np.zeros((chains, 0, states)))
 
 

@@ -54,7 +54,7 @@ LEAST_RTOL_OF_DIFFRAX = 10
 
 
 def _explain_forward_mode(solve):
-    """Solutions that say what forward mode through recorded steps needs, where JAX would name a `custom_vjp`."""
+    """A decorator: errors say what forward mode over recorded steps needs, instead of `custom_vjp`."""
 
     @functools.wraps(solve)
     def solve_or_explain(self, problem):
@@ -104,7 +104,7 @@ class Diffrax(AbstractEngine, eqx.Module):
         return cls(solver, dt, adjoint, progress)
 
     def refuses(self, problem: Problem) -> str | None:
-        """Why a scene is not for it, or the tolerance, or the number of fixed steps, as the end of a sentence."""
+        """The reason why this solver cannot solve the problem, as the end of a sentence; None if it can."""
         if problem.derivation.kicks:
             return problem.derivation.kick_refusal or (
                 "L, or its momentum p = dL/dqdot, jumps at a border: the velocities jump there, and steps of diffrax "
@@ -133,7 +133,7 @@ class Diffrax(AbstractEngine, eqx.Module):
         return None if self.dt is not None else super().tolerances(problem, y0)
 
     def lacks_memory(self, problem: Problem, members: int = 1) -> str | None:
-        """The memory that a large scene, or `members` like it, takes, as the end of a sentence; None where it is there.
+        """The end of a sentence if `members` of this large scene need more memory than there is; else None.
 
         That are the arrays of L and its gradient, those of M where it is a matrix, some states of a step, and outputs.
         """
@@ -165,7 +165,7 @@ class Diffrax(AbstractEngine, eqx.Module):
         return solution._replace(idle=steps.size * jnp.max(steps) - jnp.sum(steps))
 
     def stepping(self, problem: Problem) -> Stepping:
-        """The steps over this problem."""
+        """The solver, step-size controller and budget with which diffrax integrates this problem."""
         dtype, ts, solver = problem.layout.dtype, jnp.asarray(problem.ts), self.solver
         if solver is None:
             # States between steps are wanted for outputs inside and to locate an event.
@@ -258,14 +258,14 @@ def _solve_problem(engine: Diffrax, problem: Problem) -> Solution:
 
 
 def _start_result(y, acceleration, singular) -> RESULTS:
-    """The result code of a motion from a state with this acceleration: successful if it can go on."""
+    """The result code at a state (2n,) with this acceleration (n,), and a flag that M is singular."""
     finite = jnp.isfinite(y).all() & jnp.isfinite(acceleration).all()
     failed = jnp.where(singular, code_of(RESULTS.mass_matrix_singular), code_of(RESULTS.nonfinite_state))
     return result_from(jnp.where(finite, SUCCESSFUL, failed))
 
 
 def _explain_result(solution: Solution, form: MotionEquations, start: RESULTS, ts, numbers) -> RESULTS:
-    """The most telling of what diffrax reports, of the first and the last state, and of what the motion ran into."""
+    """The result code that tells most: of diffrax's, of those at the first and last state, and of a jump just ahead."""
     # A name has no derivative, and the search for it is a loop that reverse mode could not go back through.
     ts, solution, numbers = stop_derivatives((ts, solution, numbers))
     last = halves(solution.y_end)
@@ -289,7 +289,7 @@ def _explain_result(solution: Solution, form: MotionEquations, start: RESULTS, t
 
 
 def _flatten_event(problem: Problem, ts, y0, numbers) -> tuple[diffrax.Event, bool]:
-    """The event whose conditions take the solver's state (2n,), and whether all instants of it are located.
+    """The event for diffrax, whose conditions take flat states (2n,); and a flag that all instants are located.
 
     That of a comparison is where its difference is zero. If it holds at the start, it is the start.
     """

@@ -25,7 +25,7 @@ Acceleration = tuple[Vector, Bool[Array, ""]]  # q̈, and whether the matrix tha
 
 
 class MotionEquations(eqx.Module):
-    """The equations of a scene by two functions of (q, q̇, t, params), each traced once, however often it is called."""
+    """The acceleration and the projection of a scene, functions of (q, q̇, t, params), each traced once."""
 
     motion: Motion = eqx.field(static=True)
     accelerate: Any = eqx.field(static=True)

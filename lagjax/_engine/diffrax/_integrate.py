@@ -49,7 +49,7 @@ class Stepping(eqx.Module):
 
 
 class LiftedFunction(eqx.Module):
-    """A function whose closed-over arrays, `constants`, are its leaves.
+    """A function whose closed-over arrays became leaves, `constants`, of this pytree.
 
     `equinox.filter_closure_convert` insists on arguments that vary along the same axes of a mesh as the examples: under
     `jax.shard_map` a start that all members share does not, and a state on the way does.
@@ -113,7 +113,7 @@ def _integrate_differentiably(moving, method: Stepping, jumps: Callable, adjoint
 
 
 def _record_jumps(moving, method: Stepping, varied) -> Stepping:
-    """The method whose controller notes steps across a jump of the field that moves with the state or with `varied`."""
+    """The stepping whose controller records if a step crosses a jump; `varied` as for `crosses_jump`."""
     field, _, _, _, params = moving
     varied = jax.tree.map(lambda _: False, (field, params)) if varied is None else varied
     adaptive = isinstance(method.controller, diffrax.AbstractAdaptiveStepSizeController)
@@ -122,7 +122,7 @@ def _record_jumps(moving, method: Stepping, varied) -> Stepping:
 
 
 def _call_diffrax(moving, method: Stepping, adjoint, event=None, *more: diffrax.SubSaveAt) -> tuple[Solution, Any, Any]:
-    """The solution, what `more` diffrax saves, and whether a step crossed a jump, where that is noted."""
+    """diffrax's solution, the outputs of further `SubSaveAt`s, and a flag that a step crossed a jump (if recorded)."""
     field, project, ts, y0, params = moving
     solver = method.solver if project is None else Projected(method.solver, project)
     # Of the ends alone there is nothing to interpolate, and no test of `ts` by a call back to the host.
@@ -162,7 +162,7 @@ _CODES = np.array([
 
 
 def _set_stage_loop(solver, adjoint):
-    """The solver with a stage loop that the adjoint can differentiate, which diffrax sees to unless it is wrapped."""
+    """The solver with a loop over stages that the adjoint can differentiate; for wrapped solvers."""
     if isinstance(solver, diffrax.AbstractRungeKutta):
         return solver
     kinds = {diffrax.ForwardMode: "lax", diffrax.RecursiveCheckpointAdjoint: "checkpointed"}
@@ -229,7 +229,7 @@ def _checkpoint_count(y0, max_steps: int) -> diffrax.RecursiveCheckpointAdjoint:
 
 
 class _RecordedSteps(diffrax.AbstractStepSizeController):
-    """Steps that end at given times, padded with inf (after which the end of the integration is the next)."""
+    """A controller that repeats recorded steps: it takes their end times (K,), padded with infinity."""
 
     times: jax.Array
     jumps: "JumpTimes | None"
@@ -277,12 +277,12 @@ class JumpTimes(eqx.Module):
         return JumpTimes(*(jnp.sort(jnp.where(jnp.isfinite(x), x, jnp.inf)) for x in (low, high)))
 
     def skip_jump(self, t):
-        """The time at which the step after one that ended at t begins, and whether that is behind a jump."""
+        """The start time of the step after one that ended at t, and a flag: a jump lies between them."""
         begin = _exchange_times(t, self.before, self.behind)
         return begin, begin != t
 
     def limit_end(self, begin, end):
-        """`end`, or the first jump on the way from `begin` to it."""
+        """The step end: `end`, or the first jump between `begin` and it."""
         ahead = jnp.searchsorted(self.before, begin, side="right")
         return jnp.minimum(end, self.before.at[ahead].get(mode="fill", fill_value=jnp.inf))
 

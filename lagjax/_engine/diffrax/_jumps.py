@@ -37,12 +37,12 @@ _DECIDING = frozenset((
 
 
 def stop_derivatives(tree):
-    """The tree, whose arrays have no derivatives."""
+    """The pytree with `stop_gradient` of all its arrays."""
     return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
 
 def may_jump(motion: Motion, t, y, params) -> bool:
-    """True if F or γ has operations in it that decide on something; those of an elimination leave q̈ smooth."""
+    """True if F or γ contain a decision (a comparison, |x|, sign, …); those of eliminations leave q̈ smooth."""
     parts = [motion.force, *([motion.constraints.gamma] if motion.constrained else [])]
     return any(_makes_decisions(jax.make_jaxpr(part)(*halves(y), t, params).jaxpr) for part in parts)
 
@@ -93,7 +93,7 @@ def crosses_jump(field, varied, begin, end, params) -> jax.Array:
 
 
 def _perturb(tree, varied, by):
-    """The tree with the floats of its varied leaves a little larger or smaller, by different amounts."""
+    """The pytree with each float of the leaves `varied` changed by `by` times a factor of its own."""
     draws = np.random.default_rng(1)
 
     def move(leaf, moves):
@@ -124,7 +124,7 @@ class AdaptiveWrapper(diffrax.AbstractAdaptiveStepSizeController):
 
 
 class JumpRecorder(diffrax.AbstractStepSizeController):
-    """The steps of a controller; its state stands beside a flag, whether a step that was accepted crossed a jump."""
+    """A step-size controller whose state also has a flag: an accepted step crossed a jump of the acceleration."""
 
     controller: Any
     field: Any

@@ -59,7 +59,7 @@ class RecordMotion(NamedTuple):
 
 
 class AbstractMotions(abc.ABC):
-    """Followers of motions and their tangents; `projection` puts states on the constraints by machine code."""
+    """Integrators of N motions with tangents; `projection` puts states on the constraints by machine code."""
 
     projection: Projection | None = None
 

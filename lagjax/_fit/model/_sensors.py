@@ -159,7 +159,7 @@ def require_no_jumps(record: Record, called: str, names: tuple[str, ...], positi
     """Raise `ValueError` where a signal of a record jumps by a period; `positions` of a scene cannot jump at all."""
     for name, column in zip(names, record.matrix.T, strict=True):
         there = np.flatnonzero(np.isfinite(column))
-        jump = _jump(column[there], positions)
+        jump = _find_period_jump(column[there], positions)
         if jump is not None:
             place, period = jump
             raise ValueError(
@@ -170,7 +170,7 @@ def require_no_jumps(record: Record, called: str, names: tuple[str, ...], positi
             )
 
 
-def _jump(y: np.ndarray, positions: bool) -> tuple[int, str] | None:
+def _find_period_jump(y: np.ndarray, positions: bool) -> tuple[int, str] | None:
     """The sample before a jump by a period, and that period in words; None where there is none."""
     steps = np.abs(np.diff(y))
     if len(steps) < 8:

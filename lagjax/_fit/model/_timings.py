@@ -276,7 +276,7 @@ def _impacts_in(system: System, layout: Layout, parameters: Parameters, timings:
     """A contact is struck where it gives an impulse. Raises `ValueError` for a name that no contact has."""
     flat, (_, struck) = timings.flat, _sections(timings.section)
     names = system.contact_names(layout, parameters.restore(parameters.example))
-    short = list(map(_shorten, names))
+    short = list(map(_short_contact_name, names))
     for name in struck:
         if name not in (*short, *names):
             raise ValueError(f"Timings names the contact {name!r}, and the contacts are {', '.join(map(repr, short))}.")
@@ -306,12 +306,12 @@ def _crossings_in(system: System, layout: Layout, parameters: Parameters, timing
 
     advice = ""
     if system.touches:
-        name = _shorten(system.contact_names(layout, parameters.restore(parameters.example))[0])
+        name = _short_contact_name(system.contact_names(layout, parameters.restore(parameters.example))[0])
         advice = f" An impact that closes a gap is no crossing: Timings({name!r}, times, …) are those of a contact."
     return instants, lambda m: "crossings" + ("" if keys is None else f" of section[{keys[flat.which[m]]!r}]"), advice
 
 
-def _shorten(name: str) -> str:
+def _short_contact_name(name: str) -> str:
     """A contact's name without its role: floor of contacts['floor']."""
     return re.sub(r"^\w+\['(.*?)'\]", r"\1", name)
 

@@ -480,7 +480,7 @@ class Smooth(AbstractTransform):
         return x - spread, x + spread
 
     def draw(self, u, rng):
-        """The same u: there is one least for a smoothness."""
+        """The same u: at given smoothness there is one minimum."""
         return u
 
     def log_volume(self, u, xp: Any = np):

@@ -119,7 +119,7 @@ class Fit:
         starts = 1 if waterfall is None else len(waterfall.misfits)
         ok, message = verdict(descent, unseen, known, left, law, starts)
         ok = ok and not (selection and selection.alike)
-        starts = [residuals.restore_state(k, trial.starts[row]) for k, row in enumerate(residuals.firsts)]
+        starts = [residuals.restore_state(k, trial.starts[row]) for k, row in enumerate(residuals.first_pieces)]
         matrices, measured = _record_residuals(residuals, trial), residuals.weights > 0
         samples, squares = measured.sum(axis=0), (trial.flat() ** 2).sum(axis=0, where=measured)
         columns = noise.sigma, noise.dof, samples, known.effective, 2 * (1 - known.correlation)

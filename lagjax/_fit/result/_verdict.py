@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._equations import decide
+from lagjax._equations import truncated_svd
 from lagjax._fit.model._noise import AbstractNoise
 from lagjax._fit.model._parameters import stack_rows
 from lagjax._fit.model._records import Record
@@ -49,7 +49,7 @@ def verdict(
     """Judge if a fit can be relied upon, and say why; `left` is what the best of `starts` searches left."""
     residuals, parts = descent.residuals, [descent.message]
     strikes = any(may_jump(part.scene) for part in residuals.parts)
-    more, astray = max(64, 4 * starts), strikes and _leaves_motion(known, left)
+    more, astray = max(64, 4 * starts), strikes and _has_motion_left(known, left)
     if known.confirmed.shape[1] and strikes:
         text = f"Take starts={more}; else fix it, or measure more."
         parts.append(
@@ -91,10 +91,10 @@ def is_doubtful(descent: Descent) -> bool:
     """True where slowly changing residuals show motion that is left, or nothing depends on a parameter: where motion
     sticks or strikes, another start may then end elsewhere."""
     known = information(descent)
-    return bool(known.null.shape[1]) or _leaves_motion(known, measure_unexplained(descent))
+    return bool(known.null.shape[1]) or _has_motion_left(known, measure_unexplained(descent))
 
 
-def _leaves_motion(known: Information, left: Unexplained) -> bool:
+def _has_motion_left(known: Information, left: Unexplained) -> bool:
     return left.doubted and bool(np.nanmax(known.correlation) > _CORRELATED)
 
 
@@ -265,7 +265,7 @@ def shifts_without(states: int, triangles, records: np.ndarray, variances, white
     size, growth = 1.0 / np.sqrt(white), np.sqrt(np.maximum(variances / white, 1.0))
     held = np.pad(np.diag(prior), ((0, 0), (0, 1)))
     whole = compress_rows(np.concatenate([own.reshape(-1, own.shape[-1]), held])[None])[0][:-1, :-1] / size
-    if decide(whole, _SEEN).rank < whole.shape[1]:
+    if truncated_svd(whole, _SEEN).rank < whole.shape[1]:
         return Shifts(np.zeros(0, int), np.zeros((0, len(white))), np.zeros(0))
     names, which = np.unique(records, return_inverse=True)
     mine = compress_rows(stack_rows(own, which))

@@ -148,7 +148,7 @@ class Search:
         if joined is not None:
             worse = f"leaves {misfit(joined.noise, joined.residuals) / misfit(done.noise, part):.2g} times more"
         text = f"The records are followed in {len(pieces)} pieces, each with a start of its own: to join them {worse}"
-        if is_chaotic := (growth := _separation(done)) > _LYAPUNOV:
+        if is_chaotic := (growth := _trajectory_separation(done)) > _LYAPUNOV:
             text += f", because motions that begin side by side part e^{growth:.0f}-fold over a record."
         else:
             text += ", though the motion does not forget its start: the scene lacks something that lasts longer."
@@ -243,7 +243,7 @@ class Search:
     def _cut_records(self, u) -> list[list[Piece]]:
         pairs = zip(self.residuals.parts, self._time_scales(u), strict=True)
         scales = [scale for part, scale in pairs for _ in part.records]
-        return _levels([None if reader is None else reader.record for reader in self.readers], scales)
+        return _growing_cuts([None if reader is None else reader.record for reader in self.readers], scales)
 
     # ---- gradients ----
 
@@ -307,7 +307,7 @@ def _last_followed_level(levels_done: list[Descent]) -> int:
     return good
 
 
-def _separation(done: Descent) -> float:
+def _trajectory_separation(done: Descent) -> float:
     """λ times the length of the longest record; λ is the median over pieces of the growth of derivatives by the start
     between the first and the last third."""
     rates, states = [], done.residuals.states
@@ -327,10 +327,12 @@ def _separation(done: Descent) -> float:
 _FEWEST_IN_SEGMENT = 8  # samples
 
 
-def _levels(records: list[Record | None], scales: list[float]) -> list[list[Piece]]:
+def _growing_cuts(records: list[Record | None], scales: list[float]) -> list[list[Piece]]:
     """Cuts of records from segments of two of their time `scales` to whole records, each twice as long as the one
     before; none where records are hardly longer, and None instead of a record leaves it out."""
-    edges = [(k, record, _edges(record, 2.0 * scales[k])) for k, record in enumerate(records) if record is not None]
+    edges = [
+        (k, record, _segment_edges(record, 2.0 * scales[k])) for k, record in enumerate(records) if record is not None
+    ]
     most, found, stride = max(len(e) - 1 for *_, e in edges), [], 1
     while stride < most:
         pieces = []
@@ -344,8 +346,8 @@ def _levels(records: list[Record | None], scales: list[float]) -> list[list[Piec
     return found
 
 
-def _edges(record: Record, length: float) -> np.ndarray:
-    """The first samples of the shortest segments of one record, and its length."""
+def _segment_edges(record: Record, length: float) -> np.ndarray:
+    """The indices of the first samples of the shortest segments of a record, and its length."""
     ts = record.ts
     count = max(1, int((ts[-1] - ts[0]) / length)) if np.isfinite(length) else 1
     count = max(1, min(count, len(ts) // _FEWEST_IN_SEGMENT))

@@ -60,7 +60,7 @@ class Plan(ctypes.Structure):
 
 
 class UnfinishedRun(NamedTuple):
-    """The state of a run that a handler left unfinished: the memory of the thread and its integers.
+    """The state of a run that stopped after a time slice: the memory of the thread and its integers.
 
     As an array of `size` doubles it has some unused ones, up to the next cache line, then the memory, and at the end
     64-bit integers: those of the lanes, the number of unused doubles, the idle steps of lanes, the next member, and 1

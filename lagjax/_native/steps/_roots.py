@@ -140,7 +140,7 @@ class Roots:
         return (frame["is_root"] > 0.0) & (frame["root"] < 1.0)
 
     def step_fraction(self, frame: Frame, otherwise: float) -> Value:
-        """The root, or the end of the search, as a fraction of the step; `otherwise` if all of it was searched."""
+        """The root, or the end of the search, as a fraction of the step; `otherwise` if the whole step was searched."""
         code, root, part = frame.code, frame["root"], frame["part"]
         return code.select(root < 1.0, root * part, code.select(part < 1.0, part, otherwise))
 

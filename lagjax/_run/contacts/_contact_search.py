@@ -537,7 +537,7 @@ def check_outputs(scene: Scene, member: Member, ts: Floats, path: Floats, did: F
 
 @loop
 def find_first(scene: Scene, fell: Floats, at_once: bool, did: Floats) -> int:
-    """The watch to process first among those that `fell` (G,): of corners, then of friction, as one that jams is."""
+    """The index of the watch to process first among those that `fell` (G,): corners before friction before the rest."""
     k, r, rough = scene.k, scene.r, scene.rough
     for g in range(k + r, k + r + 2 * scene.corners):
         if fell[g] > 0:
@@ -556,7 +556,7 @@ def find_first(scene: Scene, fell: Floats, at_once: bool, did: Floats) -> int:
 
 @loop
 def change_contacts(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> int:
-    """The result after watch `first` fell: set the new state of the member, and record it in the row."""
+    """Update a member after watch `first` fell, record the change in the row, and return the result code."""
     n, k, r, x, meets, opening = scene.n, scene.k, scene.r, member.x, row.meets, room.opening
     closed = x[2 * n + 1 + scene.numbers :]
     copy(closed, room.closed, k)
@@ -663,7 +663,9 @@ def pass_corners(scene: Scene, member: Member, meets: Floats, room: Room) -> int
 
 @loop
 def write_participants(scene: Scene, member: Member, meets: Floats, row: Entry, room: Room) -> bool:
-    """Write which contacts take part where some `meets` close, and their roles; the row tells if it is an impact.
+    """Write which contacts take part in the change at contacts `meets`, and their roles.
+
+    The row tells if it is an impact.
 
     Returns whether its root was missed before.
     """
@@ -696,7 +698,7 @@ def write_participants(scene: Scene, member: Member, meets: Floats, row: Entry, 
 
 @loop
 def spread_impulse(scene: Scene, meets: Floats, found: Floats, room: Room):
-    """Write the touching contacts that an impulse at those in `meets` reaches, directly or through others."""
+    """Write into `found` (k,) the touching contacts that an impulse at `meets` reaches, or spreads to."""
     k, r, d, coupling, rough = scene.k, scene.r, scene.d, room.coupling, scene.rough
     size, touches, reached, done, count = k + r * d, room.touches, room.free, 0, 0
     copy(meets, found, k)
@@ -1079,7 +1081,7 @@ def record_force_noise(scene: Scene, member: Member, first: int, room: Room):
 
 @loop
 def write_change_name(scene: Scene, first: int, hits: bool, did: Floats, row: Entry, room: Room):
-    """Write the contact of watch `first`, and the kind of its change, into the row."""
+    """Write into the row which contact changed at watch `first`, and the kind of the change."""
     k, r, rough = scene.k, scene.r, scene.rough
     contact, change = -1, -1
     if first < k:

@@ -23,7 +23,11 @@ def findings(scene: CheckedScene) -> list[Finding]:
     if scene.is_large or scene.layout.size > _ALL_AT_ONCE:
         return _compare_along_lines(scene)
     sides = scene.sides()
-    return [found for block in _blocks(scene, sides.round_off) for found in _compare_derivatives(scene, sides, *block)]
+    return [
+        found
+        for block in _compared_derivatives(scene, sides.round_off)
+        for found in _compare_derivatives(scene, sides, *block)
+    ]
 
 
 # ---- finite ----------------------------------------------------------------------------------------------------------
@@ -95,7 +99,7 @@ def _blame_phrase(scene: CheckedScene, role: str, order: str) -> str:
 # ---- against finite differences --------------------------------------------------------------------------------------
 
 
-def _blocks(scene: CheckedScene, round_off):
+def _compared_derivatives(scene: CheckedScene, round_off):
     """Return the derivatives to compare: (name, role, derivatives (directions, outputs), directions, outputs).
 
     Directions index the 2n + 1 inputs (q, q̇, t), outputs index `Measured.here`.
@@ -197,7 +201,7 @@ def _compare_along_lines(scene: CheckedScene) -> list[Finding]:
     directions[-1, -1] = 1.0
     for direction in directions:
         for _ in range(_SHOWN):
-            off = np.flatnonzero(_off_line(scene, direction)[0].any(axis=0)).tolist()
+            off = np.flatnonzero(_compare_line(scene, direction)[0].any(axis=0)).tolist()
             blamed = [(k, i) for k in off if (i := _blamed_coordinate(scene, direction, k)) is not None]
             for k, i in blamed:
                 found = _describe_coordinate(scene, _restrict(direction, i), i, k)
@@ -213,12 +217,12 @@ def _blamed_coordinate(scene: CheckedScene, direction: np.ndarray, k: int) -> in
     part = np.flatnonzero(direction)
     while len(part) > 1:
         halves = part[: len(part) // 2], part[len(part) // 2 :]
-        part = next((of for of in halves if _off_line(scene, _restrict(direction, of))[0][:, k].any()), part[:0])
+        part = next((of for of in halves if _compare_line(scene, _restrict(direction, of))[0][:, k].any()), part[:0])
     return int(part[0]) if len(part) else None
 
 
 def _describe_coordinate(scene: CheckedScene, direction: np.ndarray, i: int, k: int) -> Finding:
-    (kinks, _), both, ahead, behind, derivative = _off_line(scene, direction)
+    (kinks, _), both, ahead, behind, derivative = _compare_line(scene, direction)
     size, along, (name, role) = direction[i], scene.names[i], _OF_LINES[k]
     sides = (behind, ahead) if size > 0 else (ahead, behind)
     values = (*(of.value[0, k] / size for of in sides), derivative[k] / size)
@@ -231,8 +235,8 @@ def _restrict(direction: np.ndarray, part) -> np.ndarray:
     return np.where(np.isin(np.arange(direction.size), part), direction, 0.0)
 
 
-def _off_line(scene: CheckedScene, direction: np.ndarray) -> tuple[np.ndarray, Slopes, Slopes, Slopes, np.ndarray]:
-    """Return flags (2, 5) of kinks and wrong derivatives along a direction; both, one-sided slopes; derivatives."""
+def _compare_line(scene: CheckedScene, direction: np.ndarray) -> tuple[np.ndarray, Slopes, Slopes, Slopes, np.ndarray]:
+    """Return flags (2, 5) of kinks and wrong derivatives along a direction; one-sided slopes; derivatives."""
     n, dtype = scene.layout.size, scene.layout.dtype
     steps = step_ladder(np.array([scene.sizes[-1] if direction[-1] else 1.0]), dtype)
     line, eps = scene.line(direction, steps[:, 0]), float(np.finfo(dtype).eps)

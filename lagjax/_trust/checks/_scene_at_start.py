@@ -109,7 +109,7 @@ class CheckedScene(NamedTuple):
         return self.derivation.form.is_sparse
 
     def line(self, direction: np.ndarray, steps: np.ndarray) -> "LineValues":
-        """Evaluate the scene along a `direction` (2n + 1,) of the coordinates, the velocities and the motion."""
+        """Return the scene's quantities at `steps` along a `direction` (2n + 1,): q, q̇ and the motion."""
         n, m, here = self.layout.size, self.measured, self.point
         moved = direction + direction[-1] * np.concatenate([here[n:-1], np.zeros(n + 1)])
         q, qdot, t, params = self.arguments

@@ -54,7 +54,7 @@ def examine(trajectory, reference=None) -> "Health":
         impacts = trajectory.impacts.count, jnp.nansum(trajectory.impacts.energy_lost, axis=-1), *shared
         doubts = trajectory.contact_changes.doubts, trajectory.contact_changes.doubted
         fields["energy_allowed"] = jnp.full_like(jnp.asarray(fields["energy_allowed"]), jnp.inf)
-    located, counts = _borders(trajectory)
+    located, counts = _count_batch_borders(trajectory)
     changes = trajectory.transitions
     guards = changes and (changes.order_matters.any(-1), jnp.isfinite(changes.let_out).any(-1))
     return Health(
@@ -100,8 +100,8 @@ def _shared_impacts(trajectory) -> tuple:
     return jnp.sum(shared, axis=-1), jnp.nanmin(jnp.where(shared, t, jnp.nan), axis=-1)
 
 
-def _borders(trajectory) -> tuple[bool, BorderCounts | None]:
-    """Return `count_borders` with the batch axes of the trajectory; None for a piecewise scene that is traced."""
+def _count_batch_borders(trajectory) -> tuple[bool, BorderCounts | None]:
+    """Return `count_borders` with the batch axes of the trajectory; None for a traced piecewise scene."""
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
         members = Members(trajectory)
         located, counts = count_borders(members)

@@ -108,7 +108,7 @@ def does_work(trajectory) -> bool:
 
 
 def _known_fields(laws: list[Law], layout: Layout) -> dict[str, Any]:
-    """Return the fields of `Health` that do not depend on the motion, none of them an array."""
+    """Return the fields of `Health` that follow from the scene alone."""
     momenta = _common_conserved(laws)
     return {
         "works": any(law.works for law in laws),
