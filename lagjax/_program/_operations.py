@@ -183,7 +183,7 @@ def _is_larger(f, c, w, u, v):
     return f("ge", u, v)
 
 
-def _own_value(f, c, w, *operands):
+def _whole(f, c, w, *operands):
     return w
 
 
@@ -218,7 +218,7 @@ def _comparison(name: str, value: Callable, symbol: str, sign: str, commutative:
     latex = f"{{0}} {sign} {{1}}"
     return Operation(
         name, 2, value, lambda code, a, b: code.compare(symbol, a, b), simplify=_simplify.compare,
-        commutative=commutative, is_logical=True, is_step=True, side=_own_value, text=f"{{0}} {symbol} {{1}}", latex=latex,
+        commutative=commutative, is_logical=True, is_step=True, side=_whole, text=f"{{0}} {symbol} {{1}}", latex=latex,
     )  # fmt: skip
 
 
@@ -234,7 +234,7 @@ def _bitwise(
 def _constant_row(
     name: str, value: Callable, llvm: Callable, simplify: Callable | None = None, **texts: Any
 ) -> Operation:
-    return Operation(name, 1, value, llvm, simplify=simplify, is_step=True, exact=True, side=_own_value, **texts)
+    return Operation(name, 1, value, llvm, simplify=simplify, is_step=True, exact=True, side=_whole, **texts)
 
 
 def _intrinsic(name: str) -> Callable:

@@ -116,7 +116,7 @@ class Batches:
         return _BatchMotions(run, (of_run, crossings), for_members), complaints, wrong
 
     def _keep_results(self, motions: "_BatchMotions") -> _Kept:
-        """What `keep` returns for every member, |h − h₀| (B,), and {member: sentence} for those where it raised."""
+        """The results of `keep` for every member, |h − h₀| (B,), and {member: sentence} for those where it raised."""
         if "keep" not in self.slow:
             try:
                 kept, drift = self._keep_all(motions.arrays, motions.params)
@@ -183,7 +183,7 @@ class Batches:
     # ---- member by member ----
 
     def _keep_one_by_one(self, motions: "_BatchMotions") -> tuple[dict[str, np.ndarray], dict[int, str]]:
-        """What `keep` returns, called member by member, (B, …) by name; and {member: sentence} where it failed."""
+        """The results of `keep`, called member by member, (B, …) by name; and {member: sentence} where it failed."""
         rows, errors = self._call_keep(motions)
         if not self.quantities and not any(rows):
             raise errors[0]  # at the first look, of all members
