@@ -199,9 +199,9 @@ class Arcs:
         of = self.sample(t, y).quantities("lagrangian", "momentum")
         return np.sum(of["momentum"] * halves(y)[1], axis=1) - of["lagrangian"].reshape(len(y))
 
-    def energy_slope(self, t, y: np.ndarray) -> np.ndarray:
-        """Return ∂h/∂y, (R, 2n)."""
-        of = self.sample(t, y).quantities("energy_by_q", "mass_matrix")
+    def energy_slope(self, y: np.ndarray) -> np.ndarray:
+        """Return ∂h/∂y (R, 2n) of a scene that does not read the time."""
+        of = self.sample(0.0, y).quantities("energy_by_q", "mass_matrix")
         return np.concatenate([of["energy_by_q"], np.einsum("rij,rj->ri", of["mass_matrix"], halves(y)[1])], axis=1)
 
     def canonical_charts(self, t, y: np.ndarray, units: Units) -> np.ndarray:

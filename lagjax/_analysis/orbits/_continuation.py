@@ -163,7 +163,7 @@ class Follower:
         if self.place is not None:
             slope[-1] = 1.0
         else:
-            by_state = self.arcs.energy_slope(0.0, point.chain.states())[0] * self.units.state[0]
+            by_state = self.arcs.energy_slope(point.chain.states())[0] * self.units.state[0]
             slope[: len(by_state)] = by_state / (np.linalg.norm(by_state) or 1.0)
         return slope
 

@@ -79,7 +79,7 @@ class Closing(NamedTuple):
         if self.energy is None:
             return np.zeros((len(y0), 0)), np.zeros((len(y0), 0, y0.shape[1]))
         off = self.arcs.energy(0.0, y0) - self.energy
-        return off[:, None], self.arcs.energy_slope(0.0, y0)[:, None]
+        return off[:, None], self.arcs.energy_slope(y0)[:, None]
 
 
 class Chain(NamedTuple):

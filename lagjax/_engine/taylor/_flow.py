@@ -198,7 +198,7 @@ class Flow:
             counts, order = done.steps[rows], order or _native.choose_order(rtol)
             found.append(Steps(done.table, np.cumsum(counts) - counts, counts, order, self.kernel, rows))
         if not (result == SUCCESSFUL).all():
-            again, flow, tolerances = self._members_to_repeat(solution, ts, params, tolerances)
+            again, flow, tolerances = self._members_to_repeat(solution, params, tolerances)
             if again.any():
                 some_ts, some_y0, some_params = select_members(again, ts, y0, params)
                 better, steps_again = flow.run_and_record(some_ts, some_y0, some_params, tolerances, room)
@@ -228,7 +228,7 @@ class Flow:
         """The accelerations q̈ (N, n) at N states."""
         return self.general_program.evaluate_many([*y.T, t, *params.T])[: self.size].T
 
-    def _members_to_repeat(self, solution, ts, params, tolerances: Tolerances) -> "tuple[np.ndarray, Flow, Tolerances]":
+    def _members_to_repeat(self, solution, params, tolerances: Tolerances) -> "tuple[np.ndarray, Flow, Tolerances]":
         """The members to run once more, with which flow and which tolerances.
 
         A program that assumes a regular mass matrix is replaced by the general one, which is long if a recursion in L

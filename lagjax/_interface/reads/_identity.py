@@ -218,7 +218,11 @@ class Walk:
             if users:
                 held = {name: x for name, x in held.items() if self.wants(name, x, thing)}
             else:  # not its caches, unless there is nothing else, as in what delegates to another object
-                held = {name: x for name, x in held.items() if not name.startswith("_") or _is_plain_value(x)} or held
+                held = {
+                    name: x
+                    for name, x in held.items()
+                    if not name.startswith("_") or isinstance(x, (int, float, complex, str, np.ndarray, jax.Array))
+                } or held
         held = {name: self.read(inside if name in inside else thing, name, x) for name, x in held.items()}
         if not held and not users:
             return self._describe_opaque(thing)
@@ -260,10 +264,6 @@ def _is_class_boilerplate(name: str, value: Any) -> bool:
     if is_dunder:
         return isinstance(value, types.FunctionType | property)
     return not isinstance(value, types.MemberDescriptorType | types.GetSetDescriptorType) and name != "_abc_impl"
-
-
-def _is_plain_value(value: Any) -> bool:
-    return isinstance(value, int | float | complex | str | np.ndarray | jax.Array)
 
 
 def _import_module(names: dict[str, Any], level: int, name: str) -> types.ModuleType | None:
@@ -393,10 +393,7 @@ def shorten_text(text: str) -> str:
 @functools.lru_cache(maxsize=4096)
 def code_text(code: types.CodeType) -> str:
     """Return a hash of what a function does, with its constants and names; independent of its line numbers."""
-    inner = [code_text(x) if isinstance(x, types.CodeType) else _constant_text(x) for x in code.co_consts]
+    shown = [sorted(map(repr, x)) if isinstance(x, frozenset) else x for x in code.co_consts]
+    inner = [code_text(x) if isinstance(x, types.CodeType) else repr(x) for x in shown]
     text = "\n".join([code.co_code.hex(), repr(code.co_names), repr(code.co_varnames), *inner])
     return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def _constant_text(x: Any) -> str:
-    return repr(sorted(map(repr, x))) if isinstance(x, frozenset) else repr(x)

@@ -199,7 +199,7 @@ class Tangent:
         due = inside & ((at - of_motion["next_begin"]) * of_motion["h"] <= 0.0)
         if self.replay.parts.kicks:  # outputs at the end belong to the next step, forward in time
             next_begin, h = of_motion["next_begin"], of_motion["h"]
-            due = due & code.compare("!=", h, 0.0) & ~((h > 0.0) & (at >= next_begin - instant_tolerance(code, at)))
+            due = due & code.compare("!=", h, 0.0) & ~((h > 0.0) & (at >= next_begin - instant_tolerance(at)))
         lane["s"] = code.select(due, at - of_motion["t"], 0.0)
         lane["is_due"] = code.flag(due)
 

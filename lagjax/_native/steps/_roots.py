@@ -208,7 +208,8 @@ class Roots:
         with code.repeat_while(lambda: code.any_lane(active()), at_most=MOST_MOVES):
             here, now = x.value, active()
             value, slope = self.value_and_slope(frame, degree, here)
-            noise, left_out = at_start + along * here, frame["doubt"] * self._eighth_power(here)
+            square = here * here
+            noise, left_out = at_start + along * here, frame["doubt"] * ((square * square) * (square * square))
             error = noise + left_out
             # A slope that what is not known, and the bend, cannot undo.
             near, steep = value <= error, slope * slope > 4.0 * (bend * error)
@@ -241,11 +242,6 @@ class Roots:
         """The distance from a zero within which P cannot exceed its error, given a bound of P″."""
         code = frame.code
         return code.maximum(code.intrinsic("sqrt", 2.0 * error / bend), frame["instant"])
-
-    def _eighth_power(self, x: Value) -> Value:
-        """The power x⁸, a bound of the power after the last one at any order."""
-        square = x * x
-        return (square * square) * (square * square)
 
     def value_and_slope(self, frame: Frame, degree: Value, x: Value) -> tuple[Value, Value]:
         code = frame.code

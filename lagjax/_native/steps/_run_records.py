@@ -2,7 +2,7 @@
 
 from lagjax._native.code._constants import DONE, EPS
 from lagjax._native.code._frame import Fields, Frame, Index, Lane
-from lagjax._native.code._ir import Code, Value
+from lagjax._native.code._ir import Value
 from lagjax._native.series._taylor import AT_BORDER, TaylorSeries
 from lagjax._native.steps._projection import Projector
 
@@ -11,7 +11,7 @@ RECORDED = 4  # numbers of a step that are written down before its state: time, 
 NUMBER = 3  # the place of that; when steps are in order a tangent writes there how large its last terms are
 
 
-def instant_tolerance(code: Code, t: Value) -> Value:
+def instant_tolerance(t: Value) -> Value:
     """The largest difference from time `t` that counts as zero."""
     return _INSTANT * abs(t)
 
@@ -56,7 +56,7 @@ class OutputWriter:
         frame["reached"] = after * forward
         if kicks is not None:
             with frame.where(kicks & (frame["h"] > 0.0)):
-                frame["reached"] = after - instant_tolerance(code, after)
+                frame["reached"] = after - instant_tolerance(after)
 
         def due():
             return moving & (frame["due"] <= frame["reached"])
