@@ -38,7 +38,7 @@ import numpy as np
 import lagjax
 from benchmarks import _report
 from benchmarks._figures import write_picture
-from lagjax._sweep import Files, Progress, run_store, status
+from lagjax._sweep import Files, Progress, read_status, run_store
 from lagjax._sweep._batch import run_batch
 from lagjax._sweep._description import Description, Sections
 
@@ -104,7 +104,7 @@ def rate(options: argparse.Namespace) -> dict[str, Any]:
                 for name, part in sorted(parts.items(), reverse=bool(turn % 2)):
                     spent[name] += _spent(part, options.bare)
                 spent["sweep"] += _spent(lambda count: run_store(store, show, count), units)
-        told = status(store)
+        told = read_status(store)
         size = sum(file.stat().st_size for file in place.rglob("*") if file.is_file())
     counts: dict[str, int] = dict.fromkeys(parts, options.bare * options.rounds * BARE) | {"sweep": members}
     each: dict[str, np.ndarray] = {name: seconds / counts[name] for name, seconds in spent.items()}
@@ -242,11 +242,11 @@ def _begin(store: Path, over: dict, unit: int | None = None) -> None:
     """A store of which nothing is done."""
     from lagjax import _sweep
 
-    work, _sweep.work = _sweep.work, lambda *_: 0
+    work, _sweep.compute_units = _sweep.compute_units, lambda *_: 0
     try:
         run(store, over, unit=unit, progress=False)
     finally:
-        _sweep.work = work
+        _sweep.compute_units = work
 
 
 def _worker(store: Path, *more: str) -> subprocess.Popen:

@@ -170,8 +170,8 @@ register(
     Registered(
         summary=lambda run: _load_show().summary(run),
         trajectory_html=lambda run: _load_show().trajectory_html(run),
-        dataset=lambda run, units, time_unit: _load_show().dataset(run, units, time_unit),
-        frame=lambda run, units, time_unit: _load_show().frame(run, units, time_unit),
+        dataset=lambda run, units, time_unit: _load_show().make_dataset(run, units, time_unit),
+        frame=lambda run, units, time_unit: _load_show().make_frame(run, units, time_unit),
         impact_frame=lambda impacts: _load_show().impact_frame(impacts),
         change_frame=lambda changes: _load_show().change_frame(changes),
         write_equations=lambda *scene: _load_show().write_equations(*scene),

@@ -34,7 +34,7 @@ _INNER = np.array([[1.0, -3.0, 3.0, -1.0], [4.0, 0.0, -6.0, 3.0], [1.0, 3.0, 3.0
 
 @dataclass(frozen=True)
 class _SplineAxis:
-    """One argument of a spline: `count` evenly spaced knots from `low` to `high`; a periodic one has no last knot.
+    """One argument of a spline: `count` even knots from `low` to `high`; a periodic axis lacks the last one.
 
     `is_size`: the argument is |v| ≥ `low`, so that the first knot is no border of machine code.
     """
@@ -55,7 +55,7 @@ class _SplineAxis:
 
     @functools.cached_property
     def pieces(self) -> np.ndarray:
-        """The polynomials of pieces (K, 4, 4), as `_INNER`; the first is before the range, the last behind it."""
+        """The cubic polynomials (K, 4, 4) of the K pieces, the first before the range and the last behind it."""
         if self.periodic:
             return _INNER[None]
         n = self.count
@@ -83,7 +83,7 @@ class _SplineAxis:
         return jnp.asarray(table)[piece], place, u - (piece - 1).astype(u.dtype)
 
     def rows(self, x: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return a derivative of the spline at x (Q,) in the range, as rows (Q, count) for the coefficients."""
+        """Return derivative number `order` of the basis at x (Q,) in the range, (Q, count)."""
         u = (x - self.low) / self.step
         piece = np.clip(np.floor(u).astype(int), 0, self.count - 1 if self.periodic else self.count - 2)
         powers = np.polynomial.polynomial.polyvander(u - piece, 3)
@@ -98,7 +98,7 @@ class _SplineAxis:
         return found
 
     def grams(self) -> list[np.ndarray]:
-        """Return ∫ B⁽ʳ⁾ᵢ B⁽ʳ⁾ⱼ over the range for r = 0, 1, 2, with the length of the range as unit."""
+        """Return ∫ B⁽ʳ⁾ᵢ B⁽ʳ⁾ⱼ over the range for r = 0, 1, 2, each (count, count); the range has length one."""
         length, count = self.high - self.low, self.count if self.periodic else self.count - 1
         nodes, weights = np.polynomial.legendre.leggauss(4)  # exact to degree 7
         x = (self.low + self.step * (np.arange(count)[:, None] + 0.5 * (nodes + 1.0))).ravel()
@@ -123,12 +123,12 @@ class FreeFunction(AbstractLaw):
 
     @functools.cached_property
     def params0(self) -> LawParameters:
-        """Zeros: no potential, friction of size one, an inertia of one."""
+        """Parameters {"spline": zeros}: a zero potential, friction of size one, an inertia of one."""
         return LawParameters(self, {"spline": np.zeros([axis.count for axis in self.axes])})
 
     @property
     def knots(self) -> tuple[np.ndarray, ...]:
-        """Those of each argument, in order."""
+        """The knots of each argument, in order."""
         return tuple(axis.knots for axis in self.axes)
 
     def __repr__(self) -> str:
@@ -187,7 +187,7 @@ class FreeFunction(AbstractLaw):
         return jnp.asarray(params["spline"])
 
     def _spline(self, coefficients, *x):
-        """Return S at x, each (…). Piece polynomials are combined first, since they are constant along a step."""
+        """Return the spline S at arguments x, each (…)."""
         x = jnp.broadcast_arrays(*x)
         found = [axis.locate(one) for axis, one in zip(self.axes, x, strict=True)]
         count, batch = len(x), x[0].ndim
@@ -205,8 +205,7 @@ class FreeFunction(AbstractLaw):
 
     @functools.cached_property
     def transforms(self) -> dict[str, Smooth]:
-        """The map by which a fit moves the numbers: they are rough by ∫ |S″|², over the range, of all second
-        derivatives, in units in which its sides are one."""
+        """The transform for `fit`: numbers have a prior of smoothness, ∫ |S″|² over the range scaled to unit sides."""
         grams, count = [axis.grams() for axis in self.axes], len(self.axes)
         total = np.zeros(2 * (math.prod(axis.count for axis in self.axes),))
         for i in range(count):

@@ -80,7 +80,7 @@ def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, me
 
     >>> lagjax.plot.trajectory(trajectory); lagjax.plot.trajectory(trajectory, lambda q, qdot: (q[0], qdot[0]))
     """
-    (layout, curves), ax = _curves(trajectory, members), _prepare_axes(ax)
+    (layout, curves), ax = _member_curves(trajectory, members), _prepare_axes(ax)
     if projection is not None:
         periods = _pair_of_periods(period, ax)
         projected = _project_curves(layout, curves, projection)
@@ -101,7 +101,7 @@ def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, me
 
 
 def _shade_spans(ax, trajectory: Trajectory) -> bool:
-    """Spans of the modes of one motion, at the lower edge of closed contacts, seven of either; False without any."""
+    """Draw the spans of modes, and at the lower edge those of closed contacts; return False without any."""
     spans = spans_of(trajectory) if np.size(trajectory.ok) == 1 else {}
     for k, (color, (name, times)) in enumerate(zip(reversed(COLORS), spans.items(), strict=False)):
         low, high, opacity = (STRIP * k, STRIP * (k + 1), 0.4) if trajectory.mode is None else (0.0, 1.0, 0.12)
@@ -111,7 +111,7 @@ def _shade_spans(ax, trajectory: Trajectory) -> bool:
 
 
 def _mark_impacts(ax, impacts: Impacts, members: int) -> bool:
-    """Marks at the lower edge for the impacts of each contact, the first seven of more; False without any."""
+    """Mark the impacts of up to seven contacts at the lower edge; return False if there are none."""
     t, before = np.atleast_2d(impacts.t), len(ax.lines)
     t = t.reshape(-1, t.shape[-1])
     chosen, columns = even_places(len(t), members), columns_of({"impact": impacts.impulse}, np.ndim(impacts.t))
@@ -170,7 +170,7 @@ def phase(trajectory: Trajectory, *coordinates: str, members: int = 30, period: 
 
     >>> lagjax.plot.phase(trajectory, "q['theta']")
     """
-    (layout, curves), ax = _curves(trajectory, members), _prepare_axes(ax)
+    (layout, curves), ax = _member_curves(trajectory, members), _prepare_axes(ax)
     places, periods = _coordinate_places(layout, coordinates), _angle_periods(layout, period)
     for color, i in zip(COLORS, places, strict=False):
         lines = [wrap_curve(q[:, i], qdot[:, i], periods[i]) for _, q, qdot in curves]
@@ -186,7 +186,7 @@ def phase(trajectory: Trajectory, *coordinates: str, members: int = 30, period: 
 
 
 def _coordinate_places(layout: Layout, coordinates: tuple[str, ...], most: int = len(COLORS)) -> list[int]:
-    """The places of coordinates by their names; the first ones, at `most`, where none is named."""
+    """The indices of named coordinates; of the first `most` if none is named."""
     if not coordinates:
         return list(range(min(layout.size, most)))
     if unknown := [name for name in coordinates if name not in layout.names]:
@@ -227,7 +227,7 @@ def compare(one: Trajectory, other, *coordinates: str, figure=None):
 
 
 def _comparison_curve(other, layout: Layout) -> tuple[np.ndarray, np.ndarray, str]:
-    """The times (T,), the values (T, n) and the style of what a motion is compared with."""
+    """Times (T,), values (T, n) and line style of `other`: a trajectory, a record, or a pair (ts, values)."""
     if isinstance(other, Trajectory):
         _require_numbers(other, "other")
         of_other, course = course_of(other)
@@ -271,7 +271,7 @@ def modes(modes: Modes, points: Callable | None = None, q: Any = None, params: A
         given, shape = (jax.tree.map(jnp.shape, x) for x in (q, jax.tree.map(lambda leaf: leaf[0], modes.shapes)))
         if given != shape:
             raise ValueError(f"q must be the equilibrium of these modes, with shapes {shape}; got {given}.")
-    shown, shapes = min(_count(count, "count"), len(frequencies)), _align_phases(modes.shapes)
+    shown, shapes = min(_require_count(count, "count"), len(frequencies)), _align_phases(modes.shapes)
     matplotlib = _import_matplotlib()
     if figure is None:
         figure = matplotlib.pyplot.figure(figsize=(min(2.4 * shown + 1.0, 12.8), 3.2), layout="constrained")
@@ -297,7 +297,7 @@ def _describe_rates(modes: Modes, k: int) -> str:
 
 
 def _align_phases(shapes):
-    """The real parts of shapes, each turned by the phase at which the sum of their squares is largest."""
+    """Real shapes from complex ones, each turned by the phase that maximises the sum of squares."""
     total = sum(jnp.sum(jnp.square(leaf).reshape(len(leaf), -1), axis=1) for leaf in jax.tree.leaves(shapes))
     turn = jnp.exp(-0.5j * jnp.angle(total))
     return jax.tree.map(lambda leaf: jnp.real(leaf * turn.reshape(-1, *[1] * (leaf.ndim - 1))), shapes)
@@ -314,7 +314,7 @@ def _deviation_bars(ax, shape) -> None:
 
 
 def _draw_swings(ax, points: Function, q, shape, params, largest: float) -> None:
-    """The points at an equilibrium, and where a coordinate has moved by `largest` along a shape, to both sides."""
+    """Draw the points at an equilibrium, and displaced along a shape to both sides by at most `largest`."""
     size = max(float(jnp.max(jnp.abs(leaf))) for leaf in jax.tree.leaves(shape))
     for swing, color, style in ((0.0, GREY, "-"), (-largest, COLORS[5], "--"), (largest, COLORS[0], "-")):
         at = jax.tree.map(lambda x, dx, s=swing: jnp.asarray(x) + s / size * dx, q, shape)
@@ -404,7 +404,7 @@ def return_map(crossings: Crossings, value: Callable, *, ax=None):
 
 
 def _section_points(crossings: Crossings, projection: Callable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """x and y of all crossings, and the member that each belongs to. Raises `ValueError` where there are none."""
+    """x and y of all crossings, and the member of each. Raises `ValueError` if there are none."""
     _require_result(crossings, "crossings", Crossings, "crossings", " for one section")
     t = np.asarray(crossings.t)
     if not np.isfinite(t).any():
@@ -459,7 +459,8 @@ def _stroboscopic_points(scene, over, start: tuple, value: Callable | None, tran
     axes = axes_of(over)
     if len(axes) != 1:
         raise ValueError(f"over must have one axis; got {join_names([axis.dimension for axis in axes])}.")
-    names, times = axes[0].names, 1 + _count(transient, "transient", 0) + np.arange(_count(points, "points"))
+    names, count = axes[0].names, _require_count(points, "points")
+    times = 1 + _require_count(transient, "transient", 0) + np.arange(count)
     if start[0] is None:
         raise ValueError("strobe is the period of the drive, 2π/ω: give it, or a function of the point.")
     if not any(map(callable, start)) and not (isinstance(start[3], dict) and {*names} & {*start[3]}):
@@ -521,7 +522,7 @@ def energy_error(trajectory: Trajectory, *, scale: float | None = None, ax=None)
 
 
 def _loses_at_transitions(trajectory: Trajectory, h: np.ndarray) -> bool:
-    """True if a transition changes the energy by more than rounding, as a fraction of the largest one."""
+    """True if a transition changes the energy h by more than rounding."""
     if (changes := trajectory.transitions) is None:
         return False
     sides = (changes.q, changes.qdot, changes.source), (changes.q_next, changes.qdot_next, changes.target)
@@ -709,16 +710,16 @@ def _require_numbers(trajectory, name: str) -> None:
     require_numbers(trajectory, "lagjax.plot draws")
 
 
-def _count(count, name: str, least: int = 1) -> int:
+def _require_count(count, name: str, least: int = 1) -> int:
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < least:
         raise ValueError(f"{name} must be a whole number, {('zero', 'one')[least]} at least; got {count!r}.")
     return int(count)
 
 
-def _curves(trajectory: Trajectory, members: int) -> tuple[Layout, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
+def _member_curves(trajectory: Trajectory, members: int) -> tuple[Layout, list[tuple[np.ndarray, ...]]]:
     """The curves (t, q, q̇) of at most this many members, evenly chosen, and the layout of their coordinates."""
     _require_numbers(trajectory, "trajectory")
-    chosen = even_places(max(1, np.size(trajectory.ok)), _count(members, "members"))
+    chosen = even_places(max(1, np.size(trajectory.ok)), _require_count(members, "members"))
     layout, courses = courses_of(trajectory, chosen)
     return layout, [course.curve() for course in courses]
 

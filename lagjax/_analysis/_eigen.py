@@ -18,7 +18,7 @@ import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 from jaxtyping import Array, Float
 
-from lagjax._equations import decide, factorize, least_norm
+from lagjax._equations import factorize, least_norm, truncated_svd
 
 Matrix = Float[Array, "n n"]
 
@@ -125,14 +125,15 @@ def _decompose(matrix: Array) -> tuple[Array, Array, Array]:
     """Return s, X and X⁻¹."""
     n, dtype = len(matrix), jnp.result_type(matrix, jnp.complex64)
     shapes = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in ((n,), (n, n), (n, n)))
-    return _call_numpy(lambda a: _map_finite(_general, a), shapes, matrix)  # pyright: ignore[reportReturnType]
+    return _call_numpy(lambda a: _map_finite(_eigendecompose, a), shapes, matrix)  # pyright: ignore[reportReturnType]
 
 
 # A basis of eigenvectors that has lost half of the digits is none: rounding splits a Jordan block of two by √eps.
 _WORST_BASIS = 1e7
 
 
-def _general(matrix: np.ndarray) -> list[np.ndarray]:
+def _eigendecompose(matrix: np.ndarray) -> list[np.ndarray]:
+    """Return s (n,), X (n, n) and X⁻¹ of one matrix, as `_decompose`."""
     values, vectors = np.linalg.eig(matrix)
     order = _eigenvalue_order(values)
     values, vectors = values[order].astype(complex), vectors[:, order].astype(complex)
@@ -170,7 +171,7 @@ def _null_space(rows: Float[Array, "m n"], rank: int) -> Float[Array, "n n-rank"
     lengths = jnp.linalg.norm(rows, axis=1, keepdims=True)
     unit = jax.lax.stop_gradient(rows / jnp.where(lengths > 0, lengths, 1))
     shape = (jax.ShapeDtypeStruct((n, n - rank), rows.dtype),)
-    return _call_numpy(lambda g: _map_finite(lambda a: [decide(a).right[:, rank:]], g), shape, unit)[0]
+    return _call_numpy(lambda g: _map_finite(lambda a: [truncated_svd(a).right[:, rank:]], g), shape, unit)[0]
 
 
 def tangent_basis(jacobian: Float[Array, "m n"], rank: int) -> Float[Array, "n n-rank"]:

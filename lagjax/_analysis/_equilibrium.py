@@ -16,7 +16,7 @@ from lagjax._analysis._sparse_balance import (
     balance_of,
     constraints_nearby,
     descend,
-    falls,
+    has_falling_direction,
     is_balanced,
     multipliers_at_rest,
     singular_direction,
@@ -69,13 +69,7 @@ class Equilibrium(NamedTuple):
 
 @accepts_singles(("q", "qdot"), ("params",))
 def equilibrium(
-    system: System,
-    q: PyTree,
-    params: PyTree = None,
-    *,
-    qdot: PyTree = None,
-    stable: bool = False,
-    throw: bool = True,
+    system: System, q: PyTree, params: PyTree = None, *, qdot: PyTree = None, stable: bool = False, throw: bool = True
 ) -> Equilibrium:
     r"""The equilibrium of `system` that Newton's method reaches from `q`.
 
@@ -128,7 +122,7 @@ def equilibrium(
     else:
         require_steady(scene)
         if stable:
-            scene = _settled_scene(scene, qdot)
+            scene = _scene_at_rest(scene, qdot)
         place, _, multipliers, ok = find_balance(scene, None)
         why = "" if not throw or not scene.concrete or ok else _explain_no_equilibrium(scene)
     if held is not None and why:
@@ -154,7 +148,7 @@ def find_balance(scene: SceneState, steady: "Steady | None") -> tuple[Vector, Ve
     return found
 
 
-def _settled_scene(scene: SceneState, qdot: PyTree) -> SceneState:
+def _scene_at_rest(scene: SceneState, qdot: PyTree) -> SceneState:
     """Return the scene at the state where friction brings it to rest; raise `ValueError` if that fails."""
     if qdot is not None:
         raise ValueError("stable=True finds where a scene comes to rest: leave qdot out, or look at normal_modes.")
@@ -163,7 +157,7 @@ def _settled_scene(scene: SceneState, qdot: PyTree) -> SceneState:
             "stable=True follows a motion until it rests, and cannot be traced: find q outside of jit, vmap and grad, "
             "and give it to equilibrium(system, q, params) inside; derivatives by params are right there."
         )
-    return SceneState.from_state(scene.system, _settled_position(scene), None, scene.params)
+    return SceneState.from_state(scene.system, _find_rest_position(scene), None, scene.params)
 
 
 def require_steady(scene: SceneState) -> None:
@@ -192,7 +186,7 @@ _STAGES, _TIMES, _AT_REST = 16, 20.0, 1e-4
 _RTOL = 1e-6
 
 
-def _settled_position(scene: SceneState) -> PyTree:
+def _find_rest_position(scene: SceneState) -> PyTree:
     """Simulate with friction until the scene is at rest; return q as a pytree, or raise `ValueError`."""
     scales, layout = scene.scales, scene.layout
     # Links between neighbours are short beside a large scene.
@@ -352,7 +346,7 @@ def _solve_large_balance(scene: SceneState, qdot: PyTree, stable: bool) -> tuple
         raise ValueError(f"Steady motions of {n} coordinates are not sought: leave qdot out, or give fewer of them.")
     of = balance_of(scene, "An equilibrium")
     if stable:
-        scene = _settled_scene(scene, None)
+        scene = _scene_at_rest(scene, None)
         of = of._replace(multipliers=multipliers_at_rest(scene))
     start = np.concatenate([scene.q, of.multipliers])
     unit, jacobian = np.asarray(jax.jit(scene.motion.unit)(*state)), of.jacobian(start)
@@ -364,7 +358,7 @@ def _solve_large_balance(scene: SceneState, qdot: PyTree, stable: bool) -> tuple
     z = descend(of.residual, of.jacobian, start, least, unit)
     z = np.where(np.abs(z) < np.finfo(float).eps ** 3 * np.abs(start), 0.0, z)
     why = "" if is_balanced(of, z, least) else _explain_no_equilibrium(scene, jacobian)
-    if not why and stable and falls(of, z, unit[:n]):
+    if not why and stable and has_falling_direction(of, z, unit[:n]):
         why = "With friction the scene came to rest where it does not stay: at a saddle. Begin farther from it."
     ok = jnp.asarray(not why)
     return nan_unless(ok, jnp.asarray(z[:n])), nan_unless(ok, jnp.asarray(z[n:])), ok, why

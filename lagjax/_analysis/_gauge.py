@@ -1,7 +1,7 @@
 """The gauge G(q, t) of a symmetry: the function whose time derivative is the change Λ of L.
 
 Λ = ∂G/∂q·q̇ + ∂G/∂t is affine in q̇, so that ∂G/∂q = ∂Λ/∂q̇ and ∂G/∂t = Λ(q, 0, t). G is their integral along the
-straight line from a reference state, where it is zero; if ∂G/∂q is constant, G = ∂G/∂q·q. `is_right` verifies the
+straight line from a reference state, where it is zero; if ∂G/∂q is constant, G = ∂G/∂q·q. `verify_gauge` verifies the
 numerical integral.
 """
 
@@ -60,7 +60,9 @@ def gauge_of(scene: SceneState, fields: Fields, weights: np.ndarray, k: int, cha
     return _gauge_function(scene, fields, weights, bool(spread and np.abs(at_rest).max() <= _ZERO * size))
 
 
-def is_right(gauge: Callable, scene: SceneState, fields: Fields, k: int, changes: Changes, states: FlatState) -> bool:
+def verify_gauge(
+    gauge: Callable, scene: SceneState, fields: Fields, k: int, changes: Changes, states: FlatState
+) -> bool:
     """True if ∂G/∂q and ∂G/∂t are those of transformation k at some states: each piece of L may have its own G."""
     restore, speeds = scene.layout.restore, fields.scale / fields.time
 
@@ -82,7 +84,7 @@ def _gauge_function(scene: SceneState, fields: Fields, weights: np.ndarray, cons
     def gauge(q, t=0.0, params=None):
         q, rest = layout.flatten(q), jnp.zeros(layout.size, layout.dtype)
         there = SceneState.from_arguments(system, layout, q, rest, params)
-        transform = fields.transform(jnp.asarray(weights, layout.dtype), params)
+        transform = fields.combine(jnp.asarray(weights, layout.dtype), params)
         start, t = jnp.asarray(reference, layout.dtype), jnp.asarray(t, layout.dtype)
 
         def change(q, qdot, t):
@@ -104,7 +106,7 @@ def _changes_at_states(weights: Array, fields: Fields, states: FlatState, *argum
     scene = SceneState.from_arguments(*arguments)
 
     def changes_at(state):
-        return jax.lax.map(lambda w: _change_at_state(scene, fields, fields.transform(w, scene.params), state), weights)
+        return jax.lax.map(lambda w: _change_at_state(scene, fields, fields.combine(w, scene.params), state), weights)
 
     return jax.lax.map(changes_at, states)
 

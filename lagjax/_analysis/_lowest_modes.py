@@ -16,7 +16,7 @@ from scipy.sparse import block_array, csc_array
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, SuperLU, eigsh, splu
 
 from lagjax._analysis._eigen import symmetric_modes
-from lagjax._equations import decide
+from lagjax._equations import truncated_svd
 
 Sparse = Any  # an array of scipy.sparse, of which type checkers do not know that it has two axes
 
@@ -54,7 +54,7 @@ def lowest_modes(
         raise ValueError(NO_MODES)
     n, rows = mass.shape[0], jacobian.shape[0]
     if count is None or needs_all(count, n - rows):
-        return _rayleigh_ritz(stiffness, mass, decide(jacobian.toarray()).null if rows else np.eye(n))
+        return _rayleigh_ritz(stiffness, mass, truncated_svd(jacobian.toarray()).null if rows else np.eye(n))
     shift, factors = lowest_shift(stiffness, mass, jacobian)
     slices: list[tuple[float, Any, int, str]] = [(shift, factors, count, "LM")]
     if rows:

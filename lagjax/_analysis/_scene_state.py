@@ -19,7 +19,7 @@ from lagjax._equations import (
     derivation_of,
     forms,
     has_constraints,
-    pieces_of_motion,
+    list_decisions,
 )
 from lagjax._interface import Layout, as_arrays, is_concrete, require_finite
 from lagjax._scene import ROLES, System, replace_functions, require_system
@@ -87,7 +87,7 @@ class SceneState(NamedTuple):
         form = self.derivation.form
         if not form.is_sparse or isinstance(form.mass, MatrixFree) or self.layout.size <= forms.LARGEST_ANALYSED_DENSE:
             return False
-        return not pieces_of_motion(self.motion, *self.derivation.state_shapes)
+        return not list_decisions(self.motion.functions, *self.derivation.state_shapes)
 
     @property
     def constrained(self) -> bool:

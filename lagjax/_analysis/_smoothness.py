@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from lagjax._analysis._scene_state import SceneState
-from lagjax._equations import Derivation, borders_of_motion, pieces_of_motion
+from lagjax._equations import Derivation, find_sides, list_decisions
 
 # Where forces are compared, in sizes of a coordinate. A border within the first distance is at the state: equilibria
 # are known to the square root of rounding at worst, to 1e-12 as a rule. Friction that is rounded off over ten times as
@@ -50,7 +50,7 @@ def require_smooth(scene: SceneState, what: str) -> None:
     names = (*scene.layout.names, *(f"d{name}" for name in scene.layout.names))
     for k in np.flatnonzero(rough.jumps | rough.kinks).tolist():
         written = scene.system._motion(scene.layout, scene.params)  # whose lines are to be named
-        pieces = pieces_of_motion(written, *scene.derivation.state_shapes)
+        pieces = list_decisions(written.functions, *scene.derivation.state_shapes)
         labels = [f"{name}{place}" for name, place, size in pieces for _ in range(size)]
         operation = labels[int(np.argmax(rough.changed[k]))]
         how = "the force jumps there" if rough.jumps[k] else "the force has another slope on either side"
@@ -64,7 +64,7 @@ def require_smooth(scene: SceneState, what: str) -> None:
 
 @functools.lru_cache(maxsize=64)
 def _is_pieced(derivation: Derivation) -> bool:
-    return bool(pieces_of_motion(derivation.motion, *derivation.state_shapes))
+    return bool(list_decisions(derivation.motion.functions, *derivation.state_shapes))
 
 
 def _measure_roughness(scene: SceneState) -> _Roughness:
@@ -72,7 +72,7 @@ def _measure_roughness(scene: SceneState) -> _Roughness:
     n, eps = len(q), jnp.finfo(q.dtype).eps
 
     def sides(y):
-        return jnp.concatenate([jnp.ravel(x) for *_, x in borders_of_motion(scene.motion, y[:n], y[n:], t, numbers)])
+        return jnp.concatenate([jnp.ravel(x) for *_, x in find_sides(scene.motion.functions, y[:n], y[n:], t, numbers)])
 
     def force(y):
         return scene.force(y[:n], y[n:])

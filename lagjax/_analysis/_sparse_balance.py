@@ -112,7 +112,7 @@ def is_balanced(of: SparseBalance, z: Unknowns, least: Unknowns) -> bool:
     return bool((np.abs(of.residual(z)) <= np.finfo(float).eps ** 0.5 * size).all())
 
 
-def falls(of: SparseBalance, z: Unknowns, unit: np.ndarray) -> bool:
+def has_falling_direction(of: SparseBalance, z: Unknowns, unit: np.ndarray) -> bool:
     """True if an equilibrium is no minimum of the potential on the constraints; `unit`: of each coordinate."""
     whole, n, scale = of.jacobian(z), len(unit), diags_array(unit)
     forces, jacobian = scale @ whole[:n, :n] @ scale, whole[n:, :n] @ scale

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from lagjax._analysis._scene_state import SceneState
-from lagjax._equations import Sample, decide, echelon_form
+from lagjax._equations import Sample, echelon_form, truncated_svd
 from lagjax._interface import halves, is_concrete
 
 # States, beside two for each number of Ω, and the numbers of Ω up to which it is sought: of more coordinates that
@@ -40,7 +40,7 @@ class SteadySymmetries(NamedTuple):
     turns: np.ndarray
 
 
-class _Terms(NamedTuple):
+class IdentityTerms(NamedTuple):
     """Terms of the identities at S states, and their derivatives by q and q̇, (S, …, n) each."""
 
     lagrangian_by_q: np.ndarray
@@ -69,11 +69,11 @@ def find_symmetries(scene: SceneState, preferred: np.ndarray) -> SteadySymmetrie
     states = np.asarray(q + 0.5 * of_q * draws[0]), np.asarray(of_qdot * draws[1])
     steps = _STEP * of_q, _STEP * of_qdot
     with jax.ensure_compile_time_eval(), np.errstate(all="ignore"):
-        terms, rates = _terms(scene, params, steps, *states)
+        terms, rates = _evaluate_terms(scene, params, steps, *states)
         consistent, of_rates = states[1], terms
         if rates.size:  # one step arrives: a is affine in q̇, as d'Alembert's principle takes it
-            consistent = states[1] - decide(np.nan_to_num(terms.rate_by_qdot), _SINGULAR).least_norm(rates)
-            of_rates, _ = _terms(scene, params, steps, states[0], np.nan_to_num(consistent))
+            consistent = states[1] - truncated_svd(np.nan_to_num(terms.rate_by_qdot), _SINGULAR).least_norm(rates)
+            of_rates, _ = _evaluate_terms(scene, params, steps, states[0], np.nan_to_num(consistent))
     terms = terms._replace(rate_by_q=of_rates.rate_by_q, rate_by_qdot=of_rates.rate_by_qdot)
     well = np.logical_and.reduce([np.isfinite(x).reshape(len(x), -1).all(axis=1) for x in (*terms, consistent)])
     if well.sum() < _STATES:
@@ -82,10 +82,12 @@ def find_symmetries(scene: SceneState, preferred: np.ndarray) -> SteadySymmetrie
             "(q, qdot): give a state in the middle of where motions take place."
         )
     units = of_q * np.where(preferred, 1.0, 1e3)
-    return _solve_identities(_Terms(*(x[well] for x in terms)), states[1][well], consistent[well], of_q, units)
+    return _solve_identities(IdentityTerms(*(x[well] for x in terms)), states[1][well], consistent[well], of_q, units)
 
 
-def _terms(scene: SceneState, params, steps: tuple, q: np.ndarray, qdot: np.ndarray) -> tuple[_Terms, np.ndarray]:
+def _evaluate_terms(
+    scene: SceneState, params, steps, q: np.ndarray, qdot: np.ndarray
+) -> tuple[IdentityTerms, np.ndarray]:
     """Return the terms at states (S, n), with second derivatives by central differences; and a."""
 
     def evaluate(y, *names):
@@ -105,10 +107,11 @@ def _terms(scene: SceneState, params, steps: tuple, q: np.ndarray, qdot: np.ndar
     (force_by_q, force_by_qdot), (residual_by_q, _) = map(halves, derivatives)
     count = scene.derivation.position_count
     of_rates = residual_by_q[:, count:], jacobian[:, count:]
-    return _Terms(by_q, momentum, force, force_by_q, force_by_qdot, jacobian[:, :count], *of_rates), residual[:, count:]
+    terms = IdentityTerms(by_q, momentum, force, force_by_q, force_by_qdot, jacobian[:, :count], *of_rates)
+    return terms, residual[:, count:]
 
 
-def _solve_identities(of: _Terms, qdot, consistent, of_q, units) -> SteadySymmetries:
+def _solve_identities(of: IdentityTerms, qdot, consistent, of_q, units) -> SteadySymmetries:
     """Solve for the symmetries, given terms at states with velocities `qdot` (S, n), `consistent` ones for a.
 
     `of_q` (n,) are sizes of coordinates; of coordinates that move together that with the largest unit is cyclic.
@@ -133,7 +136,7 @@ def _solve_identities(of: _Terms, qdot, consistent, of_q, units) -> SteadySymmet
     if left.size:
         found = np.linalg.lstsq(left, right, rcond=_SINGULAR)[0]
     # Columns that nothing but Ω balances are single directions; others may balance each other.
-    null = decide(left @ found - right, absolute=_CANCELS * len(left) ** 0.5).null if len(left) else np.eye(n)
+    null = truncated_svd(left @ found - right, absolute=_CANCELS * len(left) ** 0.5).null if len(left) else np.eye(n)
     directions = echelon_form((null * (of_q / units)[:, None]).T) * units  # by rows, in the user's units
     pivots = np.array([int(np.argmax(np.abs(row / units))) for row in directions], int)
     cyclic, moves, turns = np.zeros(n, bool), np.zeros((n, n)), np.zeros((n, n, n))

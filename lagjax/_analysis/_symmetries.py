@@ -17,13 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from lagjax._analysis._gauge import changes_of, gauge_of, is_right
+from lagjax._analysis._gauge import changes_of, gauge_of, verify_gauge
 from lagjax._analysis._noether import FlatState, charge_at, euler_lagrange, flat_generator, variation
 from lagjax._analysis._potential import absorb_potential_forces
 from lagjax._analysis._random_states import perturb_last_digits, random_states
 from lagjax._analysis._scene_state import SceneState, require_matrices
 from lagjax._analysis._transformations import Fields, fields_of, textbook_symmetries
-from lagjax._equations import decide, echelon_form, span_outside
+from lagjax._equations import echelon_form, span_outside, truncated_svd
 from lagjax._interface import Layout, accept, compile_for_one_call, show_str
 from lagjax._primitives import accepts_singles
 from lagjax._run import Trajectory
@@ -203,7 +203,7 @@ class _SymmetryColumns(NamedTuple):
     def symmetries(self, *columns: np.ndarray) -> np.ndarray:
         """Return an orthonormal basis (K, d) of the null space of these columns."""
         rows = np.concatenate(columns)
-        return decide(rows, absolute=self.threshold * np.sqrt(len(rows))).null
+        return truncated_svd(rows, absolute=self.threshold * np.sqrt(len(rows))).null
 
 
 def _measure_columns(scene: SceneState, fields: Fields, states: FlatState) -> _SymmetryColumns:
@@ -238,7 +238,7 @@ def _symmetry_columns(fields: Fields, states: FlatState, *arguments) -> tuple[Ar
 
     def expressions_at(state):
         def expression(weights):
-            transform = fields.transform(weights, scene.params)
+            transform = fields.combine(weights, scene.params)
             rate, by_q = euler_lagrange(lambda *y: variation(scene, transform, *y), state)
             return rate - by_q, _work_and_drift(scene, transform, state)
 
@@ -305,7 +305,7 @@ def _restore_units(weights: np.ndarray, fields: Fields) -> tuple:
     """Convert weights (K,) to the user's units: α, b (n,), c (n,), A (n, n), β, and those of the user's generators."""
     alpha, b, c, of_maps, beta, own = fields.split_weights(weights)
     shift, drift = b * fields.scale, c * fields.scale / fields.time
-    return alpha * fields.time, shift, drift, np.tensordot(of_maps, fields.maps, 1), beta, own
+    return alpha * fields.time, shift, drift, np.tensordot(of_maps, fields.matrices, 1), beta, own
 
 
 def _describe_combination(weights: np.ndarray, fields: Fields, names: tuple[str, ...]) -> str:
@@ -344,7 +344,7 @@ def _conserved_quantities(
     changes, states = changes_of(scene, fields, weights, states)
     for k in _select_independent_charges(names, changes.gradients):
         gauge = gauge_of(scene, fields, weights[k], k, changes)
-        if gauge is None or is_right(gauge, scene, fields, k, changes, states):
+        if gauge is None or verify_gauge(gauge, scene, fields, k, changes, states):
             quantities.append(Conserved(names[k], _noether_charge(scene, fields, weights[k], gauge), gauge))
         else:
             notes.append(f"not given: {names[k]}, by a symmetry whose gauge term could not be integrated")
@@ -358,18 +358,18 @@ def _select_independent_charges(names: list[str], gradients: np.ndarray) -> list
     """
     kept = [k for k, name in enumerate(names) if not name.startswith(_DEPENDENT)]
     for k in range(len(names)):
-        if k not in kept and any(_independent_part(of_state[kept], of_state[k]) > 1e-6 for of_state in gradients):
+        if k not in kept and any(_independent_fraction(of_state[kept], of_state[k]) > 1e-6 for of_state in gradients):
             kept.append(k)
     return kept
 
 
-def _independent_part(rows: np.ndarray, row: np.ndarray) -> float:
+def _independent_fraction(rows: np.ndarray, row: np.ndarray) -> float:
     """Return the fraction, 0 to 1, of the length of `row` (2n,) that is orthogonal to the span of `rows` (k, 2n)."""
     size = np.linalg.norm(row)
     if not len(rows) or size == 0:
         return float(size > 0)
     lengths = np.linalg.norm(rows, axis=1, keepdims=True)
-    decided = decide(rows / np.where(lengths > 0, lengths, 1), 1e-9)
+    decided = truncated_svd(rows / np.where(lengths > 0, lengths, 1), 1e-9)
     basis = decided.right[:, : int(decided.rank)]
     return float(np.linalg.norm(row - basis @ (basis.T @ row)) / size)
 
@@ -382,7 +382,7 @@ def _noether_charge(scene: SceneState, fields: Fields, weights: np.ndarray, gaug
     def charge(q, qdot, t=0.0, params=None):
         numbers = eqx.filter(params, eqx.is_array_like)
         state = layout.flatten(q), layout.flatten(qdot), jnp.asarray(t, layout.dtype), numbers
-        transform = fields.transform(jnp.asarray(weights, layout.dtype), params)
+        transform = fields.combine(jnp.asarray(weights, layout.dtype), params)
         value = charge_at(system._motion(layout, params), transform, *state)
         return value if gauge is None else value - gauge(q, t, params)
 

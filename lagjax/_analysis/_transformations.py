@@ -24,13 +24,13 @@ class Fields(NamedTuple):
     """A basis of K transformations of n coordinates: time shift, translations, boosts, maps A, time scale, the user's.
 
     - `scale` (n,), `time`: the sizes of the coordinates and of the time, by which transformations are of order one.
-    - `maps` (M, n, n): the matrices A; `names`: of all K = 2 + 2n + M + U.
+    - `matrices` (M, n, n): the matrices A; `names`: of all K = 2 + 2n + M + U.
     - `own`: the U of the user, functions (q, t, params) → (ξ, τ).
     """
 
     scale: np.ndarray
     time: float
-    maps: np.ndarray
+    matrices: np.ndarray
     names: tuple[str, ...]
     own: tuple[Callable, ...]
 
@@ -40,18 +40,18 @@ class Fields(NamedTuple):
 
     def split_weights(self, weights):
         """Split weights (K,) by kind: time (), translations (n,), boosts (n,), maps (M,), time scale (), own (U,)."""
-        n, m = len(self.scale), len(self.maps)
+        n, m = len(self.scale), len(self.matrices)
         first, last = 1 + 2 * n, 1 + 2 * n + m
         shift, drift = weights[1:first].reshape(2, n)
         return weights[0], shift, drift, weights[first:last], weights[last], weights[last + 1 :]
 
-    def transform(self, weights, params) -> Callable:
+    def combine(self, weights, params) -> Callable:
         """Return the linear combination with these weights (K,), a function (q, t) → (ξ, τ)."""
         alpha, b, c, of_maps, beta, of_own = self.split_weights(weights)
 
         def combined(q, t):
             shift = (b + c * t / self.time) * jnp.asarray(self.scale, q.dtype)
-            change, of_time = shift + jnp.tensordot(of_maps, self.maps, 1) @ q, alpha * self.time + beta * t
+            change, of_time = shift + jnp.tensordot(of_maps, self.matrices, 1) @ q, alpha * self.time + beta * t
             for k, function in enumerate(self.own):
                 more, more_time = function(q, t, params)
                 change, of_time = change + of_own[k] * more, of_time + of_own[k] * more_time
@@ -61,10 +61,10 @@ class Fields(NamedTuple):
 
     def weights(self, b=None, c=None, a=None, alpha: float = 0.0, beta: float = 0.0) -> np.ndarray | None:
         """Return the weights (K,) of one transformation; None if it is no combination of the basis."""
-        n, m = len(self.scale), len(self.maps)
+        n, m = len(self.scale), len(self.matrices)
         of_maps = np.zeros(m)
         if a is not None:
-            flat = self.maps.reshape(m, -1).T
+            flat = self.matrices.reshape(m, -1).T
             used = np.flatnonzero((flat != 0)[a.ravel() != 0].any(axis=0))
             of_maps[used] = np.linalg.lstsq(flat[:, used], a.ravel(), rcond=None)[0]
             if np.abs(flat @ of_maps - a.ravel()).max() > 1e-12 * np.abs(a).max():

@@ -15,6 +15,5 @@ from lagjax._engine._problem import (
     Solution,
     axes_per_leaf,
     concatenate_leaves,
-    rows,
 )
 from lagjax._engine._stop_reason import AHEAD, End, find_stop_flags

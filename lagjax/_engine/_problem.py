@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.extend import core
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from lagjax._equations import Derivation, derivation_of
 from lagjax._interface import (
@@ -45,7 +45,6 @@ from lagjax._interface.reads import Edition
 from lagjax._native import ATOL_OVER_MOTION, ATOL_OVER_RTOL
 from lagjax._primitives import DOUBLE, SINGLE, compute_in_doubles
 
-PyTree = Any
 Numbers = Array | np.ndarray
 
 # The default, also for a state in float32, for which machine code computes in float64: 1e-7 would leave roundings alone
@@ -75,7 +74,7 @@ class Event(NamedTuple):
 
     @property
     def ways(self) -> list[bool | None]:
-        """The directions of the functions, in their order."""
+        """The direction of each function of `functions`."""
         return jax.tree.leaves(self.directions, is_leaf=lambda leaf: leaf is None)
 
 
@@ -139,13 +138,13 @@ class Problem:
         return derivation_of(self.system, self.layout, self.params).with_numbers(self.vector)
 
     @functools.cached_property
-    def made(self) -> dict:
-        """The parts that engines have made of it, by name, and use more than once."""
+    def engine_parts(self) -> dict:
+        """A cache, by name, of the objects that engines build from this problem and use more than once."""
         return {}
 
     @property
     def numbers(self) -> PyTree:
-        """The numbers among the parameters: what can be traced. The rest is part of the program."""
+        """The parameters with None in place of everything that is no number: what JAX may trace."""
         return eqx.filter(self.params, eqx.is_array_like)
 
     @functools.cached_property
@@ -155,12 +154,12 @@ class Problem:
 
     @property
     def is_known(self) -> bool:
-        """True if nothing in it is being traced, so that it can be solved at once."""
+        """True if all times, states and parameters are concrete arrays, so that the problem can be solved at once."""
         return all(map(is_concrete, (self.ts, self.y0, self.vector)))
 
     @property
     def varies(self) -> bool:
-        """True if an input is of the type that `jax.shard_map` gives by default to what differs between devices."""
+        """True if a traced input differs between devices, by the types of `jax.shard_map`."""
         inputs = self.ts, self.y0, *jax.tree.leaves(self.numbers)
         return any(isinstance(x, Tracer) and bool(jax.typeof(x).mat.varying) for x in inputs)
 
@@ -183,7 +182,7 @@ class Problem:
 
 
 def solve_in_doubles(solve: Callable, problem: Problem):
-    """The solution by `solve` in float64, in the precision of the problem."""
+    """The solution by `solve(problem)` computed in float64, rounded to the precision of the problem."""
 
     def solve_numbers(ts, y0, params):
         return solve(replace(problem.double_precision, ts=ts, y0=y0, params=params))
@@ -230,7 +229,7 @@ class Batch(eqx.Module):
         pairs = zip(params, of_params, strict=True)
         in_front = [x if k is None else (xp := _array_library(x)).moveaxis(xp.asarray(x), k, 0) for x, k in pairs]
         of_state = (jax.tree.structure(values[name]).flatten_up_to(axes[name]) for name in ("q0", "qdot0"))
-        y0 = rows(state, itertools.chain(*of_state), size, layout.dtype)
+        y0 = stack_members(state, itertools.chain(*of_state), size, layout.dtype)
         spread = tuple(None if axis is None else 0 for axis in of_params)
         return cls(one, each, y0, structure.unflatten(in_front), spread)
 
@@ -238,7 +237,7 @@ class Batch(eqx.Module):
         return len(self.y0)
 
     def map_members(self, solve: Callable[..., Any], *more: Any) -> Any:
-        """`solve` under `jax.vmap` over the members; of `more`, that comes behind a problem, each has its own."""
+        """`jax.vmap` of `solve(problem, *more)` over the members; each array of `more` has them as first axis."""
         axes = jax.tree.unflatten(jax.tree.structure(self.params), self.axes)
 
         def solve_member(ts, y0, params, *more):
@@ -248,7 +247,7 @@ class Batch(eqx.Module):
         return jax.vmap(solve_member, in_axes=(of_ts, 0, axes, *[0] * len(more)))(ts, self.y0, self.params, *more)
 
     def map_in_turn(self, solve: Callable[[Problem], "Solution"]) -> "Solution":
-        """`solve` of one member after the other."""
+        """The solutions `solve(problem)` of the members, computed one after the other."""
         structure = jax.tree.structure(self.params)
 
         def solve_member(i):
@@ -269,7 +268,7 @@ class Batch(eqx.Module):
         return len(self.ts) == 1
 
     @property
-    def whole(self) -> Problem:
+    def with_all_times(self) -> Problem:
         """The problem of one member with the times of all, as a trajectory of the batch has them."""
         return self.member if self.shares_times else replace(self.member, ts=self.ts)
 
@@ -280,7 +279,9 @@ class Batch(eqx.Module):
         numbers = [(leaf, axis) for leaf, axis in zip(leaves, self.axes, strict=True) if eqx.is_array_like(leaf)]
         if all(axis is None for _, axis in numbers):
             return concatenate_leaves([leaf for leaf, _ in numbers], self.member.layout.dtype)[None]
-        return rows([leaf for leaf, _ in numbers], [axis for _, axis in numbers], len(self), self.member.layout.dtype)
+        return stack_members(
+            [leaf for leaf, _ in numbers], [axis for _, axis in numbers], len(self), self.member.layout.dtype
+        )
 
 
 class Solution(NamedTuple):
@@ -378,8 +379,8 @@ def concatenate_leaves(leaves: list, dtype) -> Float[Numbers, " count"]:
     return np.concatenate([np.zeros(0, dtype), *(np.asarray(leaf, dtype).ravel() for leaf in arrays)])
 
 
-def rows(leaves, axes, size: int, dtype) -> Float[Numbers, "size numbers"]:
-    """The numbers of every member end to end, shape (size, numbers); `axes` are those of the members, leaf by leaf."""
+def stack_members(leaves, axes, size: int, dtype) -> Float[Numbers, "size numbers"]:
+    """The numbers of `size` members, (size, numbers); `axes` has the member axis of each leaf, None if shared."""
     library = _array_library(*leaves)
     columns = [library.zeros((size, 0), dtype)]
     for leaf, axis in zip(leaves, axes, strict=True):
@@ -392,7 +393,7 @@ def rows(leaves, axes, size: int, dtype) -> Float[Numbers, "size numbers"]:
 
 
 def _member_shape(leaf, axis):
-    """A leaf of one member: zeros of its shape, which cost nothing, or what all members share."""
+    """One member's leaf: zeros of its shape, or the leaf itself if all members share it (axis None)."""
     if axis is None:
         return leaf
     shape = np.shape(leaf)
@@ -451,7 +452,7 @@ def _check_fields(dtype, params, ts, rtol, atol, max_steps, event) -> dict[str, 
     """The fields of a problem that depend neither on its scene nor on its state. Raises where they cannot be right."""
     ts = output_times(ts, dtype)
     require_budget(max_steps, "max_steps")
-    if rtol is not None and (reason := too_tight(require_tolerance(rtol, "rtol"), DOUBLE, LEAST_RTOL)):
+    if rtol is not None and (reason := explain_tight_rtol(require_tolerance(rtol, "rtol"), DOUBLE, LEAST_RTOL)):
         raise ValueError(f"{reason}.")
     if atol is not None:
         require_tolerance(atol, "atol")
@@ -463,8 +464,8 @@ def _check_fields(dtype, params, ts, rtol, atol, max_steps, event) -> dict[str, 
     return dict(params=as_arrays(params, dtype), ts=ts, tolerances=tolerances, max_steps=max_steps, event=event)
 
 
-def too_tight(rtol, dtype, least: float) -> str | None:
-    """Why rtol is too small, where it is below `least` units of round-off."""
+def explain_tight_rtol(rtol, dtype, least: float) -> str | None:
+    """The sentence that rtol is below `least` units of round-off; None if it is not."""
     eps = float(jnp.finfo(dtype).eps)
     if not is_concrete(rtol) or float(rtol) >= least * eps:
         return None
@@ -503,7 +504,7 @@ _PASSING_ON = ("squeeze", "reshape", "broadcast_in_dim", "copy")
 
 
 def evaluate_condition(function: Callable, *arguments) -> tuple[Any, int]:
-    """The value of an event, and 0; of a comparison the difference of its numbers, and the sign with which it holds."""
+    """An event's value, and 0; of a comparison a > b the number a − b, and the sign for which it holds."""
     leaves, structure = jax.tree.flatten(arguments)
     numbers = [i for i, x in enumerate(leaves) if eqx.is_array_like(x)]  # params may hold words as well
 
@@ -519,7 +520,7 @@ def evaluate_condition(function: Callable, *arguments) -> tuple[Any, int]:
 
 
 def _traced_difference(jaxpr, constants, arguments) -> tuple[Any, int] | None:
-    """The difference of two numbers and its sign, where a jaxpr compares them; None where it does something else."""
+    """a − b and the sign for which a jaxpr's comparison of a and b holds; None if it is no comparison."""
     (out,) = jaxpr.outvars
     equation = next((e for e in jaxpr.eqns if out in e.outvars), None)
     if equation is None:
@@ -542,7 +543,7 @@ def _traced_difference(jaxpr, constants, arguments) -> tuple[Any, int] | None:
 
 
 def signs_of_event(problem: Problem) -> list[int | None]:
-    """For each function of an event the sign of a comparison (`evaluate_condition`), 0 of a number, None of others."""
+    """For each event function the sign for which its comparison holds; 0 for a number, None for others."""
     assert problem.event is not None
     signs: list[int | None] = []
     for function in problem.event.functions:
@@ -558,7 +559,7 @@ def signs_of_event(problem: Problem) -> list[int | None]:
 
 
 def flat_condition(function: Callable, problem: Problem) -> Callable:
-    """An event as a function of the solver's state (2n,), t and the numbers among the parameters."""
+    """The event function as one of the flat state (2n,), t and the numbers among the parameters."""
 
     def condition(y, t, numbers):
         return function(*map(problem.layout.restore, halves(y)), t=t, params=eqx.combine(numbers, problem.params))

@@ -95,7 +95,7 @@ def find_stop_flags(acceleration: Callable, at: End, shrank, spent) -> tuple[jax
 
 
 def _jump_window(library, at: End, smallest, shrank):
-    """The time span at the end of a motion in which a jump is searched for."""
+    """The length of time at the end of a motion in which a jump of q̈ is searched for."""
     mean = abs(at.t - at.begin) / library.maximum(at.accepted, 1)
     fighting = at.rejected > FIGHTING * (at.accepted + at.rejected)
     wide = mean * library.where(fighting, FAR, NEAR)

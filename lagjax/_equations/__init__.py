@@ -14,7 +14,7 @@ function that are not finite or piecewise, with their source line.
 
 from lagjax._equations import _form as forms
 from lagjax._equations._accelerations import Accelerations
-from lagjax._equations._blame import borders, borders_of_motion, describe_pieces, offenders, pieces_of_motion, poles
+from lagjax._equations._blame import describe_decisions, find_offenders, find_poles, find_sides, list_decisions
 from lagjax._equations._consistency import has_constraints, inconsistent_members, require_consistent
 from lagjax._equations._constraints import ROUNDINGS, Constraints, distances, is_inconsistent
 from lagjax._equations._coupled_forces import CoupledForces, couple_forces
@@ -48,7 +48,7 @@ from lagjax._equations._many_states import (
 )
 from lagjax._equations._motion import Motion
 from lagjax._equations._patterns import jacobian_pattern, sparse_jacobian
-from lagjax._equations._rank import Decided, decide, echelon_form, null_space, span_outside
+from lagjax._equations._rank import TruncatedSVD, echelon_form, null_space, span_outside, truncated_svd
 from lagjax._equations._saddle import SaddleElimination, elimination_order
 from lagjax._equations._scales import Scales
 from lagjax._equations._sparse import Band, Blocks, Diagonal, MatrixFree, Sparse, form_of, refine

@@ -1,8 +1,8 @@
-"""The operation of a user's function that is to blame: its jaxpr, followed one equation at a time.
+"""A search for the operation in a user's function that fails: its jaxpr, evaluated one equation at a time.
 
 Every equation is evaluated by itself. One whose result is not finite although its operands are, or whose own first
-or second derivative is not finite, is an `Offender`; comparisons and their like (|x|, max, sign, floor) are `borders`,
-where a function may have a kink or a jump. Both know the line of the user's code that they come from.
+or second derivative is not finite, is an `Offender`. Comparisons and their like (|x|, max, sign, floor) decide: there a
+function may have a kink or a jump. Both know the line of the user's code that they come from.
 """
 
 import functools
@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core, source_info_util
 
-from lagjax._equations._motion import Motion
 from lagjax._interface import join_names
 from lagjax._program import OPERATIONS
 from lagjax._tracing import apply_in_jax, expand_primitive
@@ -36,25 +35,27 @@ class Offender(NamedTuple):
         return f"{self.name}({self.operands}){self.place}, whose {self.fault} is not finite there"
 
 
-def offenders(function: Callable, *arguments, derivatives: bool = True) -> list[Offender]:
-    """The operations of `function(q, qdot, t, params)` that are not finite, or whose derivatives by q, q̇, t are not."""
-    # In the order in which they are evaluated. Derivatives take a hundred times as long as values.
+def find_offenders(function: Callable, *arguments, derivatives: bool = True) -> list[Offender]:
+    """The operations of `function(q, qdot, t, params)` that are not finite, or whose derivatives by q, q̇, t are not.
+
+    They are in the order of evaluation. Derivatives take a hundred times as long as values.
+    """
     collected = []
 
     def visit(equation, operands, moves, results, place):
-        chosen = [i for i, x in enumerate(operands) if moves[i] and _floating(x)]
+        chosen = [i for i, x in enumerate(operands) if moves[i] and _is_float(x)]
         if not all(_are_finite(x) for x, moved in zip(operands, moves, strict=True) if moved):
             return
         # A NaN that is written into the function counts where it is taken, as in where(t > 1, nan, force). An infinity
         # does not: where(mask, q, -inf) is meant.
-        if not all(map(_are_finite, operands)) and not any(_floating(x) and np.isnan(x).any() for x in results):
+        if not all(map(_are_finite, operands)) and not any(_is_float(x) and np.isnan(x).any() for x in results):
             return
-        name = _name(equation)
+        name = _user_name(equation)
         if not all(_are_finite(x) for x in results):
             if equation.primitive.name == "select_n" and len(operands) == 3:
                 operands = [operands[0], operands[2], operands[1]]  # as users write it: condition, if true, if not
             collected.append(Offender(name, _failing_operands(operands, results), place, "value"))
-        elif derivatives and chosen and all(map(_are_finite, operands)) and any(_floating(x) for x in results):
+        elif derivatives and chosen and all(map(_are_finite, operands)) and any(_is_float(x) for x in results):
             first, second = _operation_derivatives(equation, operands, chosen)
             for fault, values in (("first derivative", first), ("second derivative", second)):
                 if not all(_are_finite(x) for x in values):
@@ -65,12 +66,12 @@ def offenders(function: Callable, *arguments, derivatives: bool = True) -> list[
     return collected
 
 
-def poles(function: Callable, *arguments) -> list[Offender]:
-    """The operations of `function(q, qdot, t, params)` that are next to a pole or a branch point, in order."""
+def find_poles(function: Callable, *arguments) -> list[Offender]:
+    """The operations of `function(q, qdot, t, params)` evaluated next to a pole or a branch point, in order."""
     collected = []
 
     def visit(equation, operands, moves, results, place):
-        chosen = [i for i, x in enumerate(operands) if moves[i] and _floating(x)]
+        chosen = [i for i, x in enumerate(operands) if moves[i] and _is_float(x)]
         # The result may be NaN, as that of log(x) for x < 0, whose derivatives are those of log(-x).
         if equation.primitive.name not in _WITH_POLES or not chosen or not all(map(_are_finite, operands)):
             return
@@ -79,7 +80,8 @@ def poles(function: Callable, *arguments) -> list[Offender]:
         if equation.primitive.name in _POWERS:  # x⁴ is as curved at 1e13, where there is no pole
             large = [np.where(np.abs(operands[i]) < 1, x, 0.0) for i, x in zip(chosen, large, strict=True)]
         if not all(map(_are_finite, large)):
-            collected.append(Offender(_name(equation), _failing_operands(operands, large), place, "second derivative"))
+            failing = _failing_operands(operands, large)
+            collected.append(Offender(_user_name(equation), failing, place, "second derivative"))
 
     _visit_equations(function, arguments, visit, into_rules=False)
     return collected
@@ -91,32 +93,33 @@ _POWERS = ("pow", "integer_pow")
 _WITH_POLES = frozenset(("div", "sqrt", "rsqrt", "cbrt", "pow", "integer_pow", "log", "log1p", "tan", "atan2", "acos"))
 
 
-def borders(function: Callable, *arguments) -> list[tuple[str, str, Any]]:
-    """The operations that piece `function` together: name, place, and the side on which a state is, traced or not."""
+def find_sides(functions: Sequence[Callable], *arguments) -> list[tuple[str, str, Any]]:
+    """Each operation of `functions` that decides, as |x| does: name, line, and the side of its border as an array."""
     collected = []
 
     def visit(equation, operands, moves, results, place):
-        name, row = _name(equation), OPERATIONS.get(equation.primitive.name)
+        name, row = _user_name(equation), OPERATIONS.get(equation.primitive.name)
         side = _SIDES.get(equation.primitive.name)
         if row is not None and row.side is not None:
             side = functools.partial(row.side, apply_in_jax, float)
-        of_floats = any(m and _floating(x) for m, x in zip(moves, operands, strict=True))
+        of_floats = any(m and _is_float(x) for m, x in zip(moves, operands, strict=True))
         if side is not None and (of_floats or (name == "cond" and moves[0])):
             collected.append((name, place, jnp.asarray(side(results[0], *operands), float)))
         if name in _LOOPS and of_floats:
-            whole = [jnp.ravel(jnp.asarray(x, float)) for x in results if not _floating(x)]
+            whole = [jnp.ravel(jnp.asarray(x, float)) for x in results if not _is_float(x)]
             collected.extend([(name, place, jnp.concatenate(whole))] if whole else [])
 
-    _visit_equations(function, arguments, visit, into_rules=True)
+    for function in functions:
+        _visit_equations(function, arguments, visit, into_rules=True)
     return collected
 
 
-def pieces_of(functions: Sequence[Callable], *arguments) -> list[tuple[str, str, int]]:
-    """The name and place of every border of functions, and how many numbers it compares; nothing is evaluated."""
+def list_decisions(functions: Sequence[Callable], *arguments) -> list[tuple[str, str, int]]:
+    """The operations of `find_sides`: name, line, and how many numbers each compares; nothing is evaluated."""
     collected = []
 
     def traced(*arguments):
-        collected.extend((name, place, np.size(x)) for f in functions for name, place, x in borders(f, *arguments))
+        collected.extend((name, place, np.size(x)) for name, place, x in find_sides(functions, *arguments))
         return 0.0
 
     jax.eval_shape(traced, *arguments)
@@ -133,43 +136,36 @@ _SIDES = {
     "lagjax_locate": lambda result, *operands: result,
     "cond": lambda result, which, *operands: which,
 }
-_LOOPS = ("scan", "while", "sort")  # which decide inside: the whole numbers that come out tell on which side
+_LOOPS = ("scan", "while", "sort")  # they decide inside: their integer results tell the side
 
 
-def borders_of_motion(motion: Motion, *state) -> list[tuple[str, str, Any]]:
-    """`borders` of L, the forces and the dissipation of a scene."""
-    return [border for function in motion.functions for border in borders(function, *state)]
+def describe_decisions(functions: Sequence[Callable], arguments: tuple) -> str:
+    """The operations of `list_decisions` with their lines as text, three at most; "" without any."""
+    decisions = list_decisions(functions, *arguments)
+    return join_names(list(dict.fromkeys(f"{name}{place}" for name, place, _ in decisions)), 3)
 
 
-def pieces_of_motion(motion: Motion, *state) -> list[tuple[str, str, int]]:
-    """`pieces_of` L, the forces and the dissipation of a scene."""
-    return pieces_of(motion.functions, *state)
-
-
-def describe_pieces(functions: Sequence[Callable], arguments: tuple) -> str:
-    """The operations at which functions are pieced together, and their lines: three at most; empty where none is."""
-    return join_names(list(dict.fromkeys(f"{name}{place}" for name, place, _ in pieces_of(functions, *arguments))), 3)
-
-
-# ---- following a jaxpr -----------------------------------------------------------------------------------------------
+# ---- evaluation of a jaxpr ------------------------------------------------------------------------------------------
 
 _CALLS = ("jit", "pjit", "closed_call", "core_call", "checkpoint", "remat", "remat2", "call_hi_primitive")
 _RULES = ("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
 
 
 def _visit_equations(function: Callable, arguments: tuple, visit: Callable, into_rules: bool) -> None:
-    """Evaluate `function(q, qdot, t, params)`, and show every equation that q, q̇ or t moves to `visit`."""
-    # A function with a custom rule for its derivative counts as one operation, unless `into_rules`.
+    """Evaluate `function(q, qdot, t, params)`; call `visit` with every equation that depends on q, q̇ or t.
+
+    A function with a custom derivative rule is one equation, unless `into_rules`.
+    """
     closed = jax.make_jaxpr(function)(*arguments)
     *state, params = arguments
     moves = [True] * len(jax.tree.leaves(state)) + [False] * len(jax.tree.leaves(params))
     inside = (*_CALLS, *_RULES) if into_rules else _CALLS
     with np.errstate(all="ignore"):
-        _run(closed.jaxpr, closed.consts, jax.tree.leaves(arguments), moves, "", visit, inside)
+        _run_jaxpr(closed.jaxpr, closed.consts, jax.tree.leaves(arguments), moves, "", visit, inside)
 
 
-def _run(jaxpr, constants, arguments, moves, outer: str, visit: Callable, inside: tuple[str, ...]) -> tuple[list, list]:
-    """The results of a jaxpr, and which of them depend on q, q̇ or t."""
+def _run_jaxpr(jaxpr, constants, arguments, moves, outer: str, visit: Callable, inside: Sequence[str]) -> tuple:
+    """The results of a jaxpr, and for each a flag: it depends on q, q̇ or t. Calls `inside` are entered."""
     values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *arguments], strict=True))
     depends = {v for v, m in zip(jaxpr.invars, moves, strict=True) if m}
 
@@ -185,7 +181,7 @@ def _run(jaxpr, constants, arguments, moves, outer: str, visit: Callable, inside
         place = outer or _line_phrase(equation)
         body = _called_body(equation) if equation.primitive.name in inside else None
         if body is not None:
-            results, out_moved = _run(body[0], body[1], operands, moved, place, visit, inside)
+            results, out_moved = _run_jaxpr(body[0], body[1], operands, moved, place, visit, inside)
         else:
             results = _evaluate_equation(equation, operands)
             out_moved = [any(moved)] * len(results)
@@ -215,13 +211,12 @@ def _evaluate_equation(equation, operands) -> list:
 
 def _operation_derivatives(equation, operands, chosen: list[int]) -> tuple[list, list]:
     """The first and second derivatives of one operation, summed over its results, by the `chosen` operands."""
-    # Reverse mode, then forward over reverse, as the derivation of the equations takes them.
 
     def local(*xs):
         filled = list(operands)
         for i, x in zip(chosen, xs, strict=True):
             filled[i] = x
-        return [x for x in _evaluate_equation(equation, filled) if _floating(x)]
+        return [x for x in _evaluate_equation(equation, filled) if _is_float(x)]
 
     def slopes(*xs):
         results, pull_back = jax.vjp(local, *xs)
@@ -232,7 +227,7 @@ def _operation_derivatives(equation, operands, chosen: list[int]) -> tuple[list,
     return list(first), list(second)
 
 
-def _name(equation) -> str:
+def _user_name(equation) -> str:
     body = _called_body(equation) if equation.primitive.name in _RULES else None
     own = getattr(getattr(body[0], "debug_info", None), "func_name", None) if body else None
     return own or {"select_n": "where"}.get(equation.primitive.name, equation.primitive.name)  # as users call it
@@ -246,12 +241,12 @@ def _line_phrase(equation) -> str:
     return "" if own or file == summary else f" at {os.path.basename(summary)}"
 
 
-def _floating(x) -> bool:
+def _is_float(x) -> bool:
     return jnp.issubdtype(jnp.result_type(x), jnp.floating)
 
 
 def _are_finite(x) -> bool:
-    return not _floating(x) or bool(np.isfinite(np.asarray(x)).all())
+    return not _is_float(x) or bool(np.isfinite(np.asarray(x)).all())
 
 
 def _failing_operands(operands, failing) -> str:
@@ -263,6 +258,6 @@ def _failing_operands(operands, failing) -> str:
         x = np.asarray(x)
         if x.shape == bad.shape:
             x = x[index]
-        return f"{x:.6g}" if x.ndim == 0 and _floating(x) else str(x) if x.ndim == 0 else f"array of shape {x.shape}"
+        return f"{x:.6g}" if x.ndim == 0 and _is_float(x) else str(x) if x.ndim == 0 else f"array of shape {x.shape}"
 
     return ", ".join(map(show, operands))

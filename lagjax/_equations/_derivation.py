@@ -22,7 +22,7 @@ from jaxtyping import PyTree
 
 from lagjax._equations import _form as forms
 from lagjax._equations._accelerations import Accelerations, lowered_once
-from lagjax._equations._blame import pieces_of
+from lagjax._equations._blame import list_decisions
 from lagjax._equations._coupled_forces import CoupledForces
 from lagjax._equations._form import SCALAR, Form, derived_form, form_in_xla
 from lagjax._equations._motion import Motion
@@ -319,7 +319,7 @@ class Derivation:
     @functools.cached_property
     def kicks(self) -> bool:
         """True if velocities jump at borders, because L, or a speed prescribed by a constraint, jumps."""
-        if not self.motion.constrained and not pieces_of([self.motion.lagrangian], *self.state_shapes):
+        if not self.motion.constrained and not list_decisions([self.motion.lagrangian], *self.state_shapes):
             return False  # most scenes, and the largest ones, at no cost
         try:
             return self.borders is not None and bool(self.borders.kicking)

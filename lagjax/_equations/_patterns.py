@@ -138,14 +138,14 @@ def _evaluate_jaxpr(jaxpr, constants, arguments) -> list:
             found = _evaluate_jaxpr(*((inner.jaxpr, inner.consts) if hasattr(inner, "consts") else (inner, ())), given)
         else:
             if name in ("scan", "while", "cond"):
-                params = jax.tree.map(_unroll_nested, params, is_leaf=lambda x: isinstance(x, core.ClosedJaxpr))
+                params = jax.tree.map(_unroll_jaxprs, params, is_leaf=lambda x: isinstance(x, core.ClosedJaxpr))
             found = equation.primitive.bind(*given, **params)
             found = found if equation.primitive.multiple_results else [found]
         values.update(zip(equation.outvars, found, strict=True))
     return list(map(read, jaxpr.outvars))
 
 
-def _unroll_nested(x):
+def _unroll_jaxprs(x):
     return _unroll_calls(x) if isinstance(x, core.ClosedJaxpr) else x
 
 

@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 
-class Decided(NamedTuple):
-    """The singular values of matrices (…, m, k), largest first, and the number of nonzero ones, `rank` (…)."""
+class TruncatedSVD(NamedTuple):
+    """Singular vectors and values of matrices (…, m, k), largest first, and the number `rank` (…) of nonzero ones."""
 
     left: np.ndarray  # singular vectors, one a column, (…, m, min(m, k))
     values: np.ndarray
@@ -26,7 +26,7 @@ class Decided(NamedTuple):
 
     @property
     def null(self) -> np.ndarray:
-        """An orthonormal basis (k, k − rank) of the null space of one matrix."""
+        """An orthonormal basis (k, k − rank), as columns, of the null space of one matrix."""
         return self.right[:, int(self.rank) :]
 
     def least_norm(self, b: np.ndarray) -> np.ndarray:
@@ -38,12 +38,12 @@ class Decided(NamedTuple):
         return np.einsum("...ki,...i->...k", self.right[..., :count], inner)
 
 
-def decide(matrices: np.ndarray, relative: np.ndarray | float = 0.0, absolute: float = 0.0) -> Decided:
-    """The rank of matrices (…, m, k): singular values below `absolute`, or `relative` (…) to the largest, are 0."""
+def truncated_svd(matrices: np.ndarray, relative: np.ndarray | float = 0.0, absolute: float = 0.0) -> TruncatedSVD:
+    """The SVD of matrices (…, m, k); singular values below `absolute`, or `relative` (…) of the largest, count as 0."""
     m, k = matrices.shape[-2:]
     left, values, right = np.linalg.svd(matrices, full_matrices=m < k)
     bound = np.maximum(absolute, np.asarray(relative)[..., None] * values[..., :1])
-    return Decided(left, values, np.swapaxes(right, -1, -2), np.asarray((values > bound).sum(axis=-1)))
+    return TruncatedSVD(left, values, np.swapaxes(right, -1, -2), np.asarray((values > bound).sum(axis=-1)))
 
 
 def null_space(rows: np.ndarray, threshold: float | None = None) -> np.ndarray:
@@ -57,7 +57,7 @@ def null_space(rows: np.ndarray, threshold: float | None = None) -> np.ndarray:
     """
     threshold = float(np.sqrt(np.finfo(rows.dtype).eps)) if threshold is None else threshold
     lengths = np.linalg.norm(rows, axis=1, keepdims=True)
-    return decide(rows / np.where(lengths > 0, lengths, 1), threshold).null
+    return truncated_svd(rows / np.where(lengths > 0, lengths, 1), threshold).null
 
 
 def span_outside(basis: np.ndarray, known: np.ndarray) -> np.ndarray:

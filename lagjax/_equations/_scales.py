@@ -46,10 +46,10 @@ class Scales(NamedTuple):
         q, qdot = np.asarray(q, float), np.asarray(qdot, float)
         with np.errstate(all="ignore"):
             mass = np.diagonal(evaluate("mass_matrix", q[None], qdot[None])[0])
-            return _measure_scales(evaluate, np.sqrt(np.abs(mass)), q, qdot)
+            return _compiled_scales(evaluate, np.sqrt(np.abs(mass)), q, qdot)
 
 
-def _measure_scales(evaluate, root: Numbers, q: Numbers, qdot: Numbers) -> Scales:
+def _compiled_scales(evaluate, root: Numbers, q: Numbers, qdot: Numbers) -> Scales:
     heaviest = root.max(where=np.isfinite(root), initial=0.0) or 1.0
     root = np.where((root > 0) & np.isfinite(root), root, heaviest)
     along = np.cos(np.arange(1.0, len(q) + 1)) / root  # no symmetry moves all coordinates like this

@@ -23,6 +23,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._fit.model._assembly import GivenSystem, assemble_residuals, read_systems
 from lagjax._fit.model._blas import one_blas_thread
@@ -51,10 +52,9 @@ from lagjax._fit.search._search import Search, search_again
 from lagjax._fit.search._unexplained import Unexplained, measure_unexplained
 from lagjax._interface import labelled_leaves
 from lagjax._primitives import with_doubles
-from lagjax._run.hybrid import Scene, jumps
+from lagjax._run.hybrid import Scene, may_jump
 from lagjax._scene import HOLDS
 
-PyTree = Any
 _METHODS = ("auto", "segments", "whole", "gradient")
 # Free numbers from which on a sentence says that another method may be meant. A trial of 288 numbers and 20 records of
 # 241 samples takes 1.8 s; of a network of 337 it took half a minute, and the gradient's whole descent as long.
@@ -229,7 +229,7 @@ class _FitSearch(NamedTuple):
         laws = [law for law in find_laws(self.params0) if law.law.selects]
         if laws and looks_further:
             descent, selection = select_terms(descent, self.law, laws, tell)
-        if tell and any(jumps(part.scene) for part in descent.residuals.parts):
+        if tell and any(may_jump(part.scene) for part in descent.residuals.parts):
             tell("The search has ended: motion that sticks, or strikes, is followed at both ends of every interval.")
         return Fit.from_descent(descent, self.law, waterfall, selection)
 
@@ -243,7 +243,7 @@ class _FitSearch(NamedTuple):
         readers = read_records(residuals)
         u = parameters.inverse(parameters.first)
         point, waterfall = Point(u, first_starts(residuals, readers, self.params0)), None
-        if any(jumps(part.scene) for part in residuals.parts):
+        if any(may_jump(part.scene) for part in residuals.parts):
             residuals = residuals.choose_modes(point, start_noise(residuals, readers, point))
         residuals, point = _keep_unused(residuals, point)
         residuals = begin_weakly(residuals, point, self.law)
@@ -266,7 +266,7 @@ class _FitSearch(NamedTuple):
         Raises `LostMotion` where none can be followed."""
         whole = Search(residuals, self.law, "whole", search.readers) if self.method == "auto" else search
         tell, lost, chooses = _print_line if self.progress else None, None, looks_further and self.starts is None
-        chooses &= len(residuals.parameters) > 0 and any(jumps(part.scene) for part in residuals.parts)
+        chooses &= len(residuals.parameters) > 0 and any(may_jump(part.scene) for part in residuals.parts)
         chooses &= not residuals.parameters.prior_weights.any()
         done, misfits = None, np.zeros(0)
         try:
@@ -307,7 +307,7 @@ class _FitSearch(NamedTuple):
             raise ValueError('method="gradient" goes down from one start: leave `starts` at 1.')
 
     def find_mistake(self, given: list[GivenSystem], left: Unexplained, spent: float) -> list[str]:
-        """The first mistake in records that explains a poor fit, as a sentence; `spent` is the fit's processor time."""
+        """A sentence on the first mistake in records that explains a poor fit; `spent` is its CPU time in seconds."""
         if len(given) > 1 or self.method == "gradient":
             return []
         [system], once = given, self._replace(starts=1, progress=False)

@@ -15,18 +15,16 @@ import functools
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
 from jax.interpreters import ad, batching, mlir
+from jaxtyping import PyTree
 
 from lagjax._interface import dtype_of, is_concrete
 from lagjax._primitives._linear_map import LinearMap, compute_on_host, is_zero
-
-PyTree = Any
 
 SINGLE, DOUBLE = np.dtype("float32"), np.dtype("float64")
 _NARROW = {DOUBLE: SINGLE, np.dtype("complex128"): np.dtype("complex64")}

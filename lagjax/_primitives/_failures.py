@@ -82,11 +82,8 @@ def _raise_failure(result, t_end, t_last, y_end, *, names):
     return [np.zeros(result.shape, t_end.dtype)]
 
 
-def _check_shapes(result, t_end, *_, **__):
-    return [ShapedArray(result.shape, t_end.dtype)]
-
-
-check_p = LinearMap("lagjax_check", _check_shapes, vary=lambda *_, **__: [None])
+_CHECK_SHAPES = lambda result, t_end, *_, **__: [ShapedArray(result.shape, t_end.dtype)]  # noqa: E731
+check_p = LinearMap("lagjax_check", _CHECK_SHAPES, vary=lambda *_, **__: [None])
 compute_on_host(check_p, _raise_failure)
 
 

@@ -102,8 +102,8 @@ class Repetition:
         written = [np.zeros((members, length, *shape)) for shape in of_round]
         sums = [np.zeros((members, *shape)) for shape in self.sums]
         for i, some in _round_members(count, members):
-            before = _take(carry, some)
-            found = go(*_take(x, some), *before, *_take(still, some), *_take(rows, some, i))
+            before = _pick(carry, some)
+            found = go(*_pick(x, some), *before, *_pick(still, some), *_pick(rows, some, i))
             behind, new, parts = self.split_results(found)
             for arrays, values in ((written, before if keeps else new), (carry, behind)):
                 for kept, a in zip(arrays, values, strict=True):
@@ -121,18 +121,8 @@ class Repetition:
         x_ct = [np.zeros((members, *a.shape[1:])) for a in x]
         carry_ct = [np.repeat(ct, members // len(ct), axis=0) for ct in last]
         for i, some in reversed(_round_members(count, members)):
-            given = (
-                *_take(x, some),
-                *_take(before, some, i),
-                *_take(still, some),
-                *_take(rows, some, i),
-            )
-            found = go(
-                *given,
-                *_take(carry_ct, some),
-                *_take(written, some, i),
-                *_take(sums, some),
-            )
+            given = (*_pick(x, some), *_pick(before, some, i), *_pick(still, some), *_pick(rows, some, i))
+            found = go(*given, *_pick(carry_ct, some), *_pick(written, some, i), *_pick(sums, some))
             more, behind = _split(found, self.inputs)
             for total, a in zip(x_ct, more, strict=True):
                 total[some] += a
@@ -148,7 +138,7 @@ def _round_members(count, members: int) -> list[tuple]:
     return [(i, slice(None) if (i < count).all() else np.flatnonzero(i < count)) for i in of_all]
 
 
-def _take(arrays, some, i=slice(None)) -> list:
+def _pick(arrays, some, i=slice(None)) -> list:
     """The arrays of some members, at round i if it is given; an array with one row is shared by all members."""
     return [x[some, i] if len(x) > 1 else x[:, i] for x in arrays] if isinstance(i, int) else [
         x[some] if len(x) > 1 else x for x in arrays
@@ -325,7 +315,7 @@ def _drop_batch(given, axes: tuple) -> tuple[tuple[int, ...], list[tuple[int, ..
     return tuple(batch), shapes
 
 
-def _shapes(given, of: Repetition) -> list:
+def _forward_shapes(given, of: Repetition) -> list:
     _, first, _, rows, *_ = _split_arguments(given, of)
     return [*first, *((rows[0][0], *shape) for shape in of.of_round), *of.sums]
 
@@ -354,7 +344,7 @@ def _pull_hessian(given, of: Repetition, axes):
     return [*of_x, *_pull_back([*known, *moved], of, narrow)]
 
 
-value_p = _RepeatedMap("value", _shapes, lambda of, *x: of.run(*x[:-1]), _vary_value)
-forward_p = _RepeatedMap("forward", _shapes, _evaluate_forward, _vary_forward, _pull_forward)
+value_p = _RepeatedMap("value", _forward_shapes, lambda of, *x: of.run(*x[:-1]), _vary_value)
+forward_p = _RepeatedMap("forward", _forward_shapes, _evaluate_forward, _vary_forward, _pull_forward)
 back_p = _RepeatedMap("back", _back_shapes, lambda of, *x: of.run_backward(*x), _vary_back, _pull_back)
 hessian_p = _RepeatedMap("hessian", _back_shapes, _evaluate_hessian, _vary_hessian, _pull_hessian)

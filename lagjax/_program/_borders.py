@@ -23,7 +23,7 @@ from lagjax._program._differentiation import copy_nodes, pullback
 from lagjax._program._features import UP_TO, Feature
 from lagjax._program._graph import Graph, find_ancestors
 from lagjax._program._jump_search import JumpSearch
-from lagjax._program._kick import Kick, build_kick, find_kicking_pieces
+from lagjax._program._kick import VelocityKick, build_kick, find_kicking_pieces
 from lagjax._program._levels import CLOCK, CONE, SIGN, SLIDE, Decision, Guard, list_guards
 from lagjax._program._look_ups import Table
 from lagjax._program._passes import eliminate_dead_code
@@ -65,7 +65,7 @@ class Borders(NamedTuple):
     arguments: tuple[int, ...]
     features: tuple[Feature, ...]
     holding: Holding
-    kick: Kick | None = None
+    kick: VelocityKick | None = None
     motion: "Borders | None" = None
 
     @property

@@ -25,7 +25,7 @@ import numpy as np
 from lagjax._program._cones import list_squares
 from lagjax._program._deciding import PIECEWISE, Deciding, inputs_below
 from lagjax._program._differentiation import gradient_in
-from lagjax._program._features import UP_TO, WITH_FEATURES, Feature, Features, Moving
+from lagjax._program._features import UP_TO, WITH_FEATURES, Feature, Features, MovingNodes
 from lagjax._program._graph import Graph
 from lagjax._program._levels import CLOCK, CONE, FAR, FLOOR, NOTHING, SIGN, TABLE, TRUNC, Decision
 from lagjax._program._operations import COMPARISONS, LOOK_UPS
@@ -61,12 +61,12 @@ class DecidedProgram(NamedTuple):
 
 
 class _SwitchingNumbers:
-    """The decisions of a graph; `moves(x)` tells which nodes vary, and pieces are inputs from position `first` on.
+    """The decisions of a graph, and their switching numbers; `moves(x)` is true for nodes that vary along a motion.
 
     If piece `apart` is set, the program is written twice, once for each value `side` of that piece.
     """
 
-    def __init__(self, graph: Graph, moves: Moving, first: int, apart: int | None):
+    def __init__(self, graph: Graph, moves: MovingNodes, first: int, apart: int | None):
         self.graph, self.moves, self.first, self.apart = graph, moves, first, apart
         self.decisions: list[Decision] = []
         self.pieces: list[int] = []
@@ -87,11 +87,11 @@ class _SwitchingNumbers:
         j = self._known[decision]
         return self.pieces[j] if j != self.apart or self.side is None else self.graph.number(self.side)
 
-    def known(self, x: int) -> int | None:
+    def find_sign(self, x: int) -> int | None:
         """The piece of the sign of x if that decision exists already, else None."""
         return self.piece(SIGN, x) if Decision(SIGN, x) in self._known else None
 
-    def jump(self, sign: int) -> None:
+    def record_jump(self, sign: int) -> None:
         """Record that the program jumps where this sign changes."""
         self.jumping.add(self.graph.term(sign)[1])
 
@@ -114,7 +114,7 @@ class _SwitchingNumbers:
         op, operands, _ = self.graph.nodes[size]
         for piece, y in (operands, operands[::-1]) if op == "mul" else ():
             c, base = self.graph.term(y)
-            if self.known(base) == piece:
+            if self.find_sign(base) == piece:
                 return b * c, base, piece
         return None
 
@@ -143,7 +143,7 @@ class _SwitchingNumbers:
             if self.moves(product) and np.ptp(ratio) > _RATIO_TOLERANCE * np.abs(ratio).max():
                 continue
             sign = graph.number(math.copysign(1.0, ratio[0, 0])) if self.moves(product) else f("sign", product)
-            known = self.known(y)
+            known = self.find_sign(y)
             assert known is not None
             return f("mul", sign, known)
         others[x] = values
@@ -156,7 +156,7 @@ class _PieceRewriter:
     def __init__(self, program: Recurrent, size: int, deciding: Deciding, apart: int | None):
         self.program, self.line, self.deciding = program, program.line, deciding
         self.graph = Graph(LARGEST_REWRITING * len(program.line.nodes) + 1000)
-        moves = Moving(self.graph, 2 * size + 1)
+        moves = MovingNodes(self.graph, 2 * size + 1)
         self.switches = _SwitchingNumbers(self.graph, moves, program.size, apart)
         self.features = Features(self.graph, moves)
         self.parts: dict[int, tuple[int, ...]] = {}
@@ -224,7 +224,7 @@ class _PieceRewriter:
         if sign is None:
             return None
         if op in (*COMPARISONS, "sign"):
-            self.switches.jump(sign)
+            self.switches.record_jump(sign)
             return sign if op == "sign" else f(op, sign, zero)
         if op == "abs":
             return f("mul", sign, of[0])
@@ -258,7 +258,7 @@ class _PieceRewriter:
         jumps = half if side is None else side  # where y stays as it is, it may be zero
         if jumps is None:
             return None
-        self.switches.jump(jumps)
+        self.switches.record_jump(jumps)
         angle = f("atan2", y, x)
         # What rounding has put on the other side is brought back, by a whole turn.
         above = f("select", f("prefers", number(0.0), angle), number(0.0), number(2 * math.pi))
@@ -283,7 +283,7 @@ class _PieceRewriter:
             return None
         if self.deciding.compared(i) in self.borders_of_decisions:  # which may come later in the program
             return self.switches.sign(f("sub", a, b))
-        return self.switches.known(self.graph.term(f("sub", a, b))[1])
+        return self.switches.find_sign(self.graph.term(f("sub", a, b))[1])
 
     # ---- quotients ----
 
@@ -325,12 +325,12 @@ class _PieceRewriter:
         if magnitude is None or magnitude[1] != x:
             return None
         b, _, piece = magnitude
-        self.switches.jump(piece)
+        self.switches.record_jump(piece)
         return self.graph.apply("mul", self.graph.number(a / b), piece)
 
     # ---- the end ----
 
-    def finish(self, size: int) -> DecidedProgram:
+    def pieced_program(self, size: int) -> DecidedProgram:
         of, graph, switches = self.places, self.graph, self.switches
         line = StraightLine(tuple(graph.nodes), tuple(graph.kinds), tuple(of[i] for i in self.line.outputs))
         linear = self.program.linear
@@ -363,5 +363,5 @@ def find_decisions(
     rewriting.rewrite_nodes()
     for base, exponent in powers:
         rewriting.features.record_power(rewriting.places[base], exponent)
-    found = rewriting.finish(size)
+    found = rewriting.pieced_program(size)
     return found if found.decisions or found.features else None

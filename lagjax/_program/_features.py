@@ -30,7 +30,7 @@ class Feature(NamedTuple):
     scale: float
 
 
-class Moving:
+class MovingNodes:
     """A callable: True for nodes that vary continuously along a motion; the first `count` inputs of the graph do."""
 
     def __init__(self, graph: Graph, count: int):
@@ -48,7 +48,7 @@ class Moving:
 class Features:
     """The narrow features of a program: `found` maps (argument node, kind) to a feature."""
 
-    def __init__(self, graph: Graph, moves: Moving):
+    def __init__(self, graph: Graph, moves: MovingNodes):
         self.graph, self.moves = graph, moves
         self.found: dict[tuple[int, int], Feature] = {}
 

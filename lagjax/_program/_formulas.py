@@ -190,7 +190,9 @@ class Formulas:
 
     def _join_products(self, x: Sum, product: Product) -> Sum | None:
         """Merge `product` with its partner, that of the co-functions, by an addition theorem; None without one."""
-        turns = [a for a, p in product for _ in range(min(2, int(p)) if p > 0 else 0) if self._is_angle_function(a)]
+        turns = [
+            a for a, p in product for _ in range(min(2, int(p)) if p > 0 else 0) if self.atoms[a].kind in ("sin", "cos")
+        ]
         for a, b in itertools.combinations(turns, 2):
             rest = multiply({product: 1.0}, multiply(atom_power(a, -1), atom_power(b, -1)))
             others = multiply(*(atom_power(self._co_function(of)) for of in (a, b)))
@@ -213,9 +215,6 @@ class Formulas:
             u, v = (u, v) if f == "sin" else (v, u)
             op, angle, size = "sin", add(u, v, 1.0 if c == d else -1.0), c
         return multiply(self._apply_function(op, [angle]), {ONE: size}) if angle else {ONE: size}
-
-    def _is_angle_function(self, atom: int) -> bool:
-        return self.atoms[atom].kind in ("sin", "cos")
 
     def _co_function(self, atom: int) -> int:
         of = self.atoms[atom]

@@ -48,11 +48,6 @@ Node = tuple[str, tuple[int, ...], Any]
 _ONE = ("float", 1.0, 1.0)  # the key of the constant 1
 
 
-def _have_cancelled(a: float, b: float) -> bool:
-    """True for large constants that nearly cancel, |a + b| < 1e-8 |a|: numbers added to a alone were rounded."""
-    return abs(a + b) < 1e-8 * abs(a) and abs(a) > 1e8
-
-
 def find_ancestors(nodes: Sequence[Node], outputs: Iterable[int], powers: Mapping[int, tuple] = {}) -> list[int]:
     """The ids of `outputs` and all nodes they depend on, ascending; of a node in `powers`, that is the base alone."""
     outputs, order = list(outputs), []
@@ -359,8 +354,9 @@ class Graph:
     def sum(self, a: int, b: int, sign: int) -> int:
         """The node of `a + sign*b` with like terms collected: an existing sum of the same terms if there is one."""
         left, right = self.terms(a), self.terms(b)
-        one = self._ids.get(_ONE)
-        if one in left and one in right and _have_cancelled(left[one], sign * right[one]):
+        one = self._ids.get(_ONE, -1)
+        a_one, b_one = left.get(one, 0.0), sign * right.get(one, 0.0)
+        if abs(a_one) > 1e8 and abs(a_one + b_one) < 1e-8 * abs(a_one):  # large constants that nearly cancel
             return self._round_by_adding(a, b, sign)
         terms = dict(left)
         for base, coefficient in right.items():

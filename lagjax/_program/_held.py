@@ -138,7 +138,7 @@ class HeldMotion:
         places = copy_nodes(graph, line, lambda i, _: self.state.get(i))
         return [places[i] for i in line.outputs]
 
-    def finish(self) -> tuple[StraightLine, tuple[frozenset[int], ...]]:
+    def retraction_line(self) -> tuple[StraightLine, tuple[frozenset[int], ...]]:
         """The line from the inputs of the program to the state, and the set of coordinates that each border moves."""
         graph = self.graph
         line = eliminate_dead_code(graph, [self.state[i] for i in range(2 * self.n)])

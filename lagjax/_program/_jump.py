@@ -45,7 +45,7 @@ _LARGEST_JUMP = 1000  # operations that one may become: a bound for errors
 
 
 class Nesting(NamedTuple):
-    """The layout of a motion of `base` coordinates with its tangents, tangents of all these, and so on.
+    """The layout of a motion of `base` coordinates with tangents, and tangents of all these, and so on.
 
     `directions[k]` is the number of directions at level k. Rows of coordinates follow each other: the motion, its
     tangents, then the tangents of all rows before.
@@ -65,7 +65,7 @@ class Nesting(NamedTuple):
 
     @property
     def disjoint_rows(self) -> list[tuple[int, int, int]]:
-        """Triples of rows (a + b, a, b): derivatives along directions of which none is shared by a and b."""
+        """Triples of rows (a + b, a, b), where a and b are derivatives without a common direction."""
         counts, found = [1 + count for count in self.directions], []
         place = functools.partial(np.ravel_multi_index, dims=counts, order="F")
         for index in itertools.product(*map(range, counts)):
@@ -146,7 +146,7 @@ class Jump(NamedTuple):
 
 
 def with_borders_of_tangents(borders: Borders, size: int, directions: int, member: int) -> Borders:
-    """The borders of a motion together with its tangents along `directions` directions D; between borders it is smooth.
+    """The borders of a motion with its tangents along D = `directions` directions; tangents have no further borders.
 
     The inputs q, q̇ and parameters have 1 + D rows, the motion and then one for each direction, and so have the
     accelerations. `member` is the number of parameters of a member, some of which are read by look-ups only.
@@ -191,7 +191,7 @@ def row_places(n: int, numbers: int, rows: int, row: int) -> list[int]:
 
 
 def _table_of_row(shift: int) -> TangentTable:
-    """A map from a table of the motion to that of a row of tangents, whose parameters come `shift` positions later."""
+    """A map from tables of the motion to those of a row of tangents, `shift` positions later."""
     return lambda table: shift_look_up(table, shift)
 
 
@@ -259,15 +259,17 @@ class _Jets:
 
 
 class _JumpBuilder:
-    """The construction of the jump of state and tangents at a border in one graph, in the arithmetic of jets."""
+    """Builds the jump of state and tangents at a border, in the arithmetic of jets, as one graph."""
 
     def __init__(self, borders: Borders, size: int, directions: tuple[int, ...], member: int, over_steps: bool):
         program = borders.program
         self.jets, self.n, self.pieces = _Jets(directions), size, len(borders.decisions)
         self.member, self.over_steps = member, over_steps
-        self.chosen = self.pieces * (2 if borders.levels_move else 1)  # numbers that choose what is zero at the border
+        self.selectors = self.pieces * (
+            2 if borders.levels_move else 1
+        )  # numbers that choose what is zero at the border
         self.numbers = program.size - 2 * size - 1 - self.pieces
-        fixed, dtypes = self.pieces + self.chosen, program.dtypes[: self.moving]
+        fixed, dtypes = self.pieces + self.selectors, program.dtypes[: self.moving]
         line = eliminate_dead_code(program.line, program.line.outputs[:size])
         self.switch, self.kick = _switching_number(borders, program.size), None
         self.field, self.switches = (self._add_rows(line, dtypes, fixed) for line in (line, self.switch))
@@ -318,13 +320,14 @@ class _JumpBuilder:
 
     def _moving_rates(self, place: list[Jet], pieces: Sequence[int]) -> list[Jet]:
         """The time derivatives, as jets, of all moving inputs: q̇, q̈, 1 for the time, 0 for parameters."""
-        unused = [self.graph.number(0.0)] * self.chosen
+        unused = [self.graph.number(0.0)] * self.selectors
         none: Jet = [None] * self.jets.rows
         one: Jet = [self.graph.number(1.0), *none[1:]]
         acceleration = self._jet_values(self.field, place, [*pieces, *unused])
         return [*place[self.n : 2 * self.n], *acceleration, one, *[none] * self.numbers]
 
     def _flow_jets(self, place: list[Jet], pieces: Sequence[int], delay: Jet) -> list[Jet]:
+        """The moving inputs after the flow over the time `delay`, by one Runge–Kutta step, as jets."""
         jets, rates, stages = self.jets, [], _STAGES[len(self.jets.directions) - 1]
         for weights in stages:
             here = place
@@ -349,6 +352,7 @@ class _JumpBuilder:
 
     @property
     def _lower_jets(self) -> int:
+        """The number of lower rows: those without a derivative along the last level's directions."""
         return self.jets.rows // (1 + self.jets.directions[-1])
 
     def build(self) -> Jump:
@@ -371,7 +375,7 @@ class _JumpBuilder:
             for x, y in zip(place[: 2 * n], back[: 2 * n], strict=True):
                 results.append(zero if y[row] is None else graph.apply("sub", y[row], x[row]))
         line = eliminate_dead_code(graph, [*results, *a_before, *a_behind])
-        return Jump(line, self.jets.orders, self._lower_jets, 2 * self.pieces + self.chosen)
+        return Jump(line, self.jets.orders, self._lower_jets, 2 * self.pieces + self.selectors)
 
     def _jump_inputs(self) -> tuple[list[Jet], list[int], list[int], list[int]]:
         """The inputs in the order of `Jump`: jets of moving inputs, pieces before and behind, selecting numbers."""
@@ -383,7 +387,7 @@ class _JumpBuilder:
             return [self.graph.input(next(count), "float") for _ in range(size)]
 
         q, v, (t,), p = some(lower * n), some(lower * n), some(1), some(lower * numbers)
-        before, behind, hit = some(m), some(m), some(self.chosen)
+        before, behind, hit = some(m), some(m), some(self.selectors)
         q, v, p = q + some(upper * n), v + some(upper * n), p + some(upper * numbers)
         time: Jet = [t, *[None] * (rows - 1)]
         jets: list[Jet] = [[q[row * n + i] for row in range(self.jets.rows)] for i in range(n)]

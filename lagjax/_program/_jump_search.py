@@ -62,6 +62,7 @@ class BothSides:
         return self.before[k] == self.behind[k]
 
     def _subtract_sides(self, k: int) -> int:
+        """The node of the difference of node k between both sides, from the differences of its operands if possible."""
         f, (op, operands, _), parts = self.graph.apply, self.line.nodes[k], self._differing_operands(k)
         if self._is_unchanged(k):
             return self.graph.constant(0.0, "float")

@@ -61,7 +61,7 @@ class Mechanics(NamedTuple):
         return cls(first[0], *parts)
 
 
-class Kick(NamedTuple):
+class VelocityKick(NamedTuple):
     """The kick at borders where L jumps.
 
     `line` takes q, q̇, t, the parameters, the m pieces before and behind the border, then the weights of the switching
@@ -113,14 +113,14 @@ def find_kicking_pieces(decided: DecidedProgram, count: int) -> dict[int, str | 
 
 def build_kick(
     line: StraightLine, n: int, size: int, decisions: Sequence[Decision], count: int, kicking: dict[int, str | None]
-) -> Kick:
+) -> VelocityKick:
     """The kick of a program with `size` inputs before its pieces; its last `count` outputs are those of `Mechanics`."""
     spatial = [j for j in kicking if not inputs_below(line, [decisions[j].switch]).isdisjoint(range(n))]
     # At corners where the rate of a constraint jumps, velocities are NaN: no law gives those after it.
     corners = [j for j in spatial if kicking[j] == JUMPING_CONSTRAINT]
     refused = tuple((j, reason) for j, reason in kicking.items() if reason is not None and j not in corners)
     if refused:
-        return Kick(StraightLine((), (), ()), tuple(kicking), refused)
+        return VelocityKick(StraightLine((), (), ()), tuple(kicking), refused)
     mechanics, m = Mechanics.from_nodes(line.outputs[-count:], n), len(decisions)
     graph = Graph(_LARGEST_KICK * (len(line.nodes) + (n + len(mechanics.rates)) ** 3) + 10_000)
     sides = BothSides(graph, line, size, m)
@@ -137,7 +137,7 @@ def build_kick(
     kicked, is_enough = _kick_velocities(graph, sides, mechanics, slopes, passes)
     bent = f("and", bent, _rate_jumps(graph, sides, mechanics, n)) if corners else bent
     kicked = [f("select", bent, x, graph.number(math.nan)) for x in kicked]
-    return Kick(eliminate_dead_code(graph, [*kicked, is_enough]), tuple(kicking))
+    return VelocityKick(eliminate_dead_code(graph, [*kicked, is_enough]), tuple(kicking))
 
 
 def _rate_jumps(graph: Graph, sides: BothSides, of: Mechanics, n: int) -> int:

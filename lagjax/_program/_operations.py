@@ -183,7 +183,7 @@ def _is_larger(f, c, w, u, v):
     return f("ge", u, v)
 
 
-def _result(f, c, w, *operands):
+def _whole(f, c, w, *operands):
     return w
 
 
@@ -218,7 +218,7 @@ def _comparison(name: str, value: Callable, symbol: str, sign: str, commutative:
     latex = f"{{0}} {sign} {{1}}"
     return Operation(
         name, 2, value, lambda code, a, b: code.compare(symbol, a, b), simplify=_simplify.compare,
-        commutative=commutative, is_logical=True, is_step=True, side=_result, text=f"{{0}} {symbol} {{1}}", latex=latex,
+        commutative=commutative, is_logical=True, is_step=True, side=_whole, text=f"{{0}} {symbol} {{1}}", latex=latex,
     )  # fmt: skip
 
 
@@ -231,8 +231,10 @@ def _bitwise(
     )  # fmt: skip
 
 
-def _step(name: str, value: Callable, llvm: Callable, simplify: Callable | None = None, **texts: Any) -> Operation:
-    return Operation(name, 1, value, llvm, simplify=simplify, is_step=True, exact=True, side=_result, **texts)
+def _constant_row(
+    name: str, value: Callable, llvm: Callable, simplify: Callable | None = None, **texts: Any
+) -> Operation:
+    return Operation(name, 1, value, llvm, simplify=simplify, is_step=True, exact=True, side=_whole, **texts)
 
 
 def _intrinsic(name: str) -> Callable:
@@ -359,11 +361,11 @@ _ROWS = (
         cotangents=(lambda f, c, g, w, u, v: _share(f, c, g, v, u), lambda f, c, g, w, u, v: _share(f, c, g, u, v)),
         side=_is_larger, c="minimum({0}, {1})", latex=r"\min\left({0}, {1}\right)",
     ),
-    _step("sign", np.sign, lambda code, x: code.select(x > 0.0, 1.0, code.select(x < 0.0, -1.0, x)), _odd,
+    _constant_row("sign", np.sign, lambda code, x: code.select(x > 0.0, 1.0, code.select(x < 0.0, -1.0, x)), _odd,
           c="({0} > 0.0 ? 1.0 : {0} < 0.0 ? -1.0 : {0})"),
-    _step("floor", np.floor, _intrinsic("floor"), latex=r"\left\lfloor{0}\right\rfloor"),
-    _step("ceil", np.ceil, _intrinsic("ceil"), latex=r"\left\lceil{0}\right\rceil"),
-    _step("trunc", np.trunc, _intrinsic("trunc")),
+    _constant_row("floor", np.floor, _intrinsic("floor"), latex=r"\left\lfloor{0}\right\rfloor"),
+    _constant_row("ceil", np.ceil, _intrinsic("ceil"), latex=r"\left\lceil{0}\right\rceil"),
+    _constant_row("trunc", np.trunc, _intrinsic("trunc")),
     # The largest power of two that is at most |x|, and 1 for 0: for weights that do not change what is computed with
     # them. It has therefore no side: no step has to end where it jumps.
     Operation(
@@ -371,7 +373,7 @@ _ROWS = (
         lambda code, x: code.library("exp2", code.library("logb", code.select(code.compare("==", x, 0.0), 1.0, x))),
         is_step=True, exact=True, c="exp2(logb({0} == 0.0 ? 1.0 : {0}))",
     ),
-    _step("round", _round, lambda code, x, method: code.intrinsic("rint" if method == 1 else "round", x),
+    _constant_row("round", _round, lambda code, x, method: code.intrinsic("rint" if method == 1 else "round", x),
           c="{rounds}({0})"),
     Operation(
         "select", 3, _select, lambda code, predicate, no, yes: code.select(predicate, yes, no), lax="select_n",

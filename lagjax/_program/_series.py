@@ -101,7 +101,7 @@ def series(program: Recurrent, size: int, moving: int, followed: Sequence[int] =
     """
     with np.errstate(all="ignore"):  # a constant may be 1/0, where the mass matrix is singular: that is found later
         outputs = list(program.line.outputs)
-        return _Recurrences(program, size, moving, followed).finish(outputs, size, list(followed))
+        return _Recurrences(program, size, moving, followed).build_lines(outputs, size, list(followed))
 
 
 class _Recurrences:
@@ -266,7 +266,7 @@ class _Recurrences:
 
     # ---- the end: only what the outputs need ----
 
-    def finish(self, outputs: list[int], size: int, followed_nodes: list[int]) -> Series:
+    def build_lines(self, outputs: list[int], size: int, followed_nodes: list[int]) -> Series:
         """The two straight lines, with only those Cauchy products, rows and values that the outputs depend on."""
         rates = self.solution[:size] or [self._output_coefficient(i) for i in outputs[:size]]
         followed = [self._output_coefficient(i) for i in followed_nodes]

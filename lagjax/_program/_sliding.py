@@ -178,7 +178,7 @@ class _SlidingForces:
             held.set_back(0, by_position, levels, lambda left: of_positions.solve(self.graph, left), pushes)
         solve = functools.partial(equations.solve, self.graph)
         held.set_back(self.rows.n, range(len(pushed)), self.levels, solve, pushed)
-        return held.finish()
+        return held.retraction_line()
 
     def _find_groups(self) -> list[int]:
         """A group number for each row: rows of different groups move and read coordinates that A does not couple."""

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax._engine import Problem, Solution
-from lagjax._engine.taylor import MachineCode, Noted, Surfaces, surfaces_of
+from lagjax._engine.taylor import FoundCrossings, MachineCode, Surfaces, surfaces_of
 from lagjax._equations import has_constraints, require_consistent
 from lagjax._interface import (
     RESULTS,
@@ -34,8 +34,8 @@ from lagjax._interface import (
 from lagjax._primitives import allows_nan, raise_where_failed, sentence, undefined_unless
 from lagjax._program import Unlowerable
 from lagjax._run._trajectory import Trajectory
-from lagjax._run.contacts import note_sections
-from lagjax._run.hybrid import Hybrid, Scene, follow_modes, require_scene
+from lagjax._run.contacts import find_section_changes
+from lagjax._run.hybrid import Hybrid, Scene, require_scene, simulate_modes
 
 _TOO_MANY = code_of(RESULTS.max_crossings_reached)
 
@@ -131,7 +131,7 @@ def crossings(
     if isinstance(scene, Hybrid):
         ts = jnp.asarray(ts)[jnp.array([0, -1])]
         watched = scene.with_sections(functions, directions, count)
-        run = follow_modes(watched, q0, qdot0, ts, params, rtol, atol, max_steps, throw=False)
+        run = simulate_modes(watched, q0, qdot0, ts, params, rtol, atol, max_steps, throw=False)
         notes = _notes_from_hybrid(run, len(scene.transitions), len(functions))
         return _read_crossings(notes, ts, len(functions), count, layout, names, throw, inputs)
     problem = Problem.from_arguments(scene, layout, q0, qdot0, ts, params, rtol, atol, max_steps)
@@ -139,7 +139,7 @@ def crossings(
         q0, qdot0 = as_arrays((q0, qdot0), layout.dtype, "state")
         require_consistent(scene, layout, problem.ts, q0, qdot0, problem.params)
     if scene.touches:
-        notes = note_sections(problem, functions, directions, count)
+        notes = find_section_changes(problem, functions, directions, count)
         return _read_crossings(notes, problem.ts, len(functions), count, layout, names, throw, inputs)
     surfaces = surfaces_in(problem, functions, directions, names)
     solution, noted = MachineCode().crossings(problem, surfaces, count)
@@ -151,7 +151,7 @@ def crossings(
 
 
 def _notes_from_hybrid(run: Trajectory, first: int, sections: int) -> tuple:
-    """The notes of a hybrid motion, as from `note_sections`: its transitions with numbers from `first` on."""
+    """The notes of a hybrid motion, as from `find_section_changes`: its transitions with numbers from `first` on."""
     changes, flatten = run.transitions, Layout.from_state(*run.end[1:]).flatten
     assert changes is not None
     # A section that holds where the motion begins is met at once, and not crossed.
@@ -168,13 +168,13 @@ def _read_crossings(notes: tuple, ts, sections: int, count: int, layout: Layout,
     places = jnp.argsort(~there, axis=1, stable=True)[:, :count]
     found = jnp.take_along_axis(there, places, axis=1)
     t, y = undefined_unless(found, t[places], inputs), undefined_unless(found[..., None], y[places], inputs)
-    noted, many = Noted(t, y, there.sum(axis=1)), there.sum(axis=1) > count
+    noted, many = FoundCrossings(t, y, there.sum(axis=1)), there.sum(axis=1) > count
     if throw:
         noted = _raise_unless_ok(layout, ts, end, noted, jnp.where(many.any(), _TOO_MANY, result))
     return restore_crossings(layout, names, noted, (result == SUCCESSFUL) & ~many)
 
 
-def _overall_result(noted: Noted, solution: Solution, count: int, library: Any = np) -> tuple:
+def _overall_result(noted: FoundCrossings, solution: Solution, count: int, library: Any = np) -> tuple:
     """The result code, the time and state up to which it is complete, and which sections have all crossings."""
     well, many = solution.result == SUCCESSFUL, noted.count > count
     too_many = well & library.any(many)
@@ -189,7 +189,7 @@ def _overall_result(noted: Noted, solution: Solution, count: int, library: Any =
 _how_it_ended_traced = jax.jit(functools.partial(_overall_result, library=jnp), static_argnums=2)
 
 
-def _raise_unless_ok(layout: Layout, ts, end: tuple, noted: Noted, result) -> Noted:
+def _raise_unless_ok(layout: Layout, ts, end: tuple, noted: FoundCrossings, result) -> FoundCrossings:
     """The crossings if all went well; else `SimulationError`, at run time if traced."""
     if not all(map(is_concrete, (result, *end, ts))):
         t, y = raise_where_failed((noted.t, noted.y), result, end, ts[-1], layout.names)
@@ -199,7 +199,7 @@ def _raise_unless_ok(layout: Layout, ts, end: tuple, noted: Noted, result) -> No
     return noted
 
 
-def restore_crossings(layout: Layout, names, noted: Noted, ok) -> Crossings | dict[str, Crossings]:
+def restore_crossings(layout: Layout, names, noted: FoundCrossings, ok) -> Crossings | dict[str, Crossings]:
     """The crossings in the user's pytree, in a dict if the sections have names."""
 
     def section_crossings(k: int) -> Crossings:

@@ -33,8 +33,8 @@ from lagjax._interface import (
 )
 from lagjax._primitives import allows_nan
 from lagjax._run._trajectory import EACH, RunSettings, State, Trajectory, raise_unless_ok, step_counts
-from lagjax._run.contacts import follow_contacts, follow_contacts_batch
-from lagjax._run.hybrid import Hybrid, follow_modes
+from lagjax._run.contacts import simulate_contact_batch, simulate_contacts
+from lagjax._run.hybrid import Hybrid, simulate_modes
 from lagjax._scene import System, lift_batch, lift_problem, require_system
 
 if TYPE_CHECKING:
@@ -183,7 +183,7 @@ def simulate(
         _refuse_options("a lagjax.Hybrid", of_engines)
         if max_transitions is not None:
             system = dataclasses.replace(system, max_transitions=max_transitions)
-        return follow_modes(system, q0, qdot0, ts, params, rtol, atol, max_steps, throw)
+        return simulate_modes(system, q0, qdot0, ts, params, rtol, atol, max_steps, throw)
     system = require_system(system, contacts=True)
     if system.touches:
         _refuse_options("a scene with contacts", of_engines)
@@ -193,7 +193,7 @@ def simulate(
     given = Problem.from_arguments(system, layout, q0, qdot0, ts, params, rtol, atol, max_steps, event)
     problem = lift_problem(given)
     if system.touches:
-        trajectory = follow_contacts(given, problem, max_transitions)
+        trajectory = simulate_contacts(given, problem, max_transitions)
         return raise_unless_ok(trajectory, layout, lambda: advice(trajectory.result)) if throw else trajectory
     if has_constraints(system):
         q0, qdot0 = as_arrays((q0, qdot0), layout.dtype, "state")
@@ -276,12 +276,12 @@ def simulate_batch(
         )
         raise
     values = {name: as_arrays(value, batch.member.layout.dtype, name) for name, value in values.items()}
-    inconsistent = inconsistent_members(system, batch.member.layout, batch.whole.ts, values, axes)
+    inconsistent = inconsistent_members(system, batch.member.layout, batch.with_all_times.ts, values, axes)
     of_params = values["params"], batch_axes[2]
     if engine is None:
-        trajectory = follow_contacts_batch(given, batch, max_transitions, *of_params)
+        trajectory = simulate_contact_batch(given, batch, max_transitions, *of_params)
     else:
-        trajectory = trajectory_of(given.whole, engine, engine.solve_batch(batch), given.y0, *of_params)
+        trajectory = trajectory_of(given.with_all_times, engine, engine.solve_batch(batch), given.y0, *of_params)
     return trajectory if inconsistent is None else _mask_inconsistent(trajectory, inconsistent)
 
 

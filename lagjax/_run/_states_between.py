@@ -28,8 +28,8 @@ from lagjax._interface import (
 )
 from lagjax._run._batch_members import spread_params, spread_rows
 from lagjax._run._trajectory import RunSettings, State, Trajectory
-from lagjax._run.contacts import follow_contacts_batch
-from lagjax._run.hybrid import Hybrid, follow_modes
+from lagjax._run.contacts import simulate_contact_batch
+from lagjax._run.hybrid import Hybrid, simulate_modes
 from lagjax._scene import lift_batch
 
 
@@ -161,7 +161,7 @@ def _follow_lanes(run: Trajectory, settings: "RunSettings", ts, member: np.ndarr
 
         def follow(q, qdot, ts, start, params):
             scene = Hybrid(modes, list(settings.transitions), start, settings.max_transitions or 0)
-            return follow_modes(scene, q, qdot, ts, params, rtol, atol, settings.max_steps, False)
+            return simulate_modes(scene, q, qdot, ts, params, rtol, atol, settings.max_steps, False)
 
         done = jax.vmap(follow, (0, 0, 0, 0, axes))(q, qdot, jnp.asarray(ts), mode, params)
         result, q, qdot = done.result._value, done.q, done.qdot
@@ -171,7 +171,7 @@ def _follow_lanes(run: Trajectory, settings: "RunSettings", ts, member: np.ndarr
         given = Batch.from_values(run.system, values, of_leaves, len(member), ts, rtol, atol, settings.max_steps)
         batch = lift_batch(given)
         if run.system.touches:
-            done = follow_contacts_batch(given, batch, settings.max_transitions, params, axes)
+            done = simulate_contact_batch(given, batch, settings.max_transitions, params, axes)
             result, q, qdot = done.result._value, done.q, done.qdot
         else:
             done = engine.solve_batch(batch)

@@ -558,7 +558,7 @@ def constant_unless(varies, tree: PyTree) -> PyTree:
     return jax.tree.map(constant, tree)
 
 
-def follow_in_doubles(motion: Callable, problem: Problem, *more) -> Any:
+def run_in_doubles(motion: Callable, problem: Problem, *more) -> Any:
     """`motion(layout, ts, y0, params, *more)` of a problem in float64, converted to the problem's precision."""
     given = problem.ts, problem.y0, problem.params, *more
     if not problem.is_single:
@@ -567,15 +567,15 @@ def follow_in_doubles(motion: Callable, problem: Problem, *more) -> Any:
     return compute_in_doubles(functools.partial(motion, layout), *given)
 
 
-def follow_in_numbers(follow: Callable, problem: Problem, *more) -> Any:
-    """`follow_rows` for the one member of a problem, without the axis of members."""
+def run_single(follow: Callable, problem: Problem, *more) -> Any:
+    """The result of `run_rows` for a problem of one member, without the axis of members."""
     rows = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
-    found = follow_rows(follow, problem, *rows, *more)
+    found = run_rows(follow, problem, *rows, *more)
     return jax.tree.map(lambda x: np.asarray(x)[0], found)
 
 
-def follow_rows(follow: Callable, member: Problem, ts, y0, vectors, *more) -> Any:
-    """`follow(layout, params, ts, y0, vectors, *more)` of members with concrete numbers, in their precision.
+def run_rows(follow: Callable, member: Problem, ts, y0, vectors, *more) -> Any:
+    """`integrate(layout, params, ts, y0, vectors, *more)` for members with concrete numbers, in their precision.
 
     They have `ts` (N, T) or (1, T), `y0` (N, 2n), `vectors` (N, P) or (1, P); the rest is that of one `member`.
     """

@@ -18,7 +18,7 @@ from jaxtyping import PyTree
 
 from lagjax._engine import Batch, Problem
 from lagjax._interface import Function
-from lagjax._interface.reads import Edition, place_in
+from lagjax._interface.reads import Edition, index_of
 from lagjax._scene._system import ARGUMENTS, ROLES, replace_functions
 
 
@@ -114,7 +114,7 @@ def _lift_function(function: Function, roles: int, problem: Problem, values: lis
     reads = "multipliers" in function.extras
     more = problem.system.multiplier_shapes(layout, problem.params) if reads else {}
     closed, shapes = jax.make_jaxpr(call_with_numbers, return_shape=True)((state,) * roles, t, numbers, more)
-    places = tuple(place_in(values, c) if isinstance(c, Tracer) else None for c in closed.consts)
+    places = tuple(index_of(values, c) if isinstance(c, Tracer) else None for c in closed.consts)
     constants = tuple(None if isinstance(c, Tracer) else c for c in closed.consts)
     # The first arguments of the trace are what it took from outside. An edition also says where the
     # values stand in it, so that equal functions with equal places are one.

@@ -13,12 +13,12 @@ from lagjax._show._animation import Animation, make_animation, require_points
 from lagjax._show._c_source import write_c
 from lagjax._show._course import course_of, courses_of, join_curve, spans_of, wrap_curve
 from lagjax._show._equations_text import Equations, write_equations
-from lagjax._show._export import change_frame, columns_of, dataset, frame, impact_frame, spread_prefix
+from lagjax._show._export import change_frame, columns_of, impact_frame, make_dataset, make_frame, spread_prefix
 from lagjax._show._notebook import (
     COLORS,
-    cell,
     draw_curves,
     even_places,
+    html_cell,
     render_picture,
     simplify_axes,
     trajectory_html,

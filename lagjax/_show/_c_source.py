@@ -109,7 +109,10 @@ class _SceneSource:
         """Return {function name: (its straight line, a comment)}."""
         of, n = self.derivation, self.n
         lines = {
-            "acceleration": (_settle(of.accelerations.program.complete.line), f"qddot[{n}]; NaN where M is singular"),
+            "acceleration": (
+                _mask_singular(of.accelerations.program.complete.line),
+                f"qddot[{n}]; NaN where M is singular",
+            ),
             "mass_matrix": (of.program("mass_matrix").line, f"M, {n} rows of {n}"),
             "energy": (_energy_program(of).line, "p qdot - L, one number"),
         }
@@ -141,7 +144,7 @@ class _SceneSource:
         return self.numbers.form(_STEP.format(**settings, project=project).replace("double", self.numbers.type))
 
 
-def _settle(line: StraightLine) -> StraightLine:
+def _mask_singular(line: StraightLine) -> StraightLine:
     """Return accelerations that are NaN where the line's last output, the singularity indicator, is positive."""
     graph = Graph.from_line(line, 2 * len(line.nodes) + 10)
     *values, singular = line.outputs

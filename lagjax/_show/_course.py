@@ -19,7 +19,7 @@ POINTS = 2400
 
 
 class Course(NamedTuple):
-    """The knots of one member in the order of the motion: times (K,), q (K, n) and q̇ (K, n)."""
+    """The course of one member: times (K,), q (K, n) and q̇ (K, n) at outputs and transitions, in order."""
 
     t: np.ndarray
     q: np.ndarray

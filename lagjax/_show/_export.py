@@ -15,7 +15,7 @@ from lagjax._run import CHANGE_WORDS, Members
 from lagjax._show._summary import import_package, require_numbers
 
 
-def dataset(trajectory, units: PyTree = None, time_unit: str | None = None):
+def make_dataset(trajectory, units: PyTree = None, time_unit: str | None = None):
     """Return an `xarray.Dataset` of a trajectory: see `Trajectory.to_xarray`."""
     xarray = import_package("to_xarray()", "xarray", "xarray")
     require_numbers(trajectory, "to_xarray() copies")
@@ -41,7 +41,7 @@ def dataset(trajectory, units: PyTree = None, time_unit: str | None = None):
     return xarray.Dataset(variables, coords={"t": ((*members, "time"), times, of_time)})
 
 
-def frame(trajectory, units: PyTree = None, time_unit: str | None = None):
+def make_frame(trajectory, units: PyTree = None, time_unit: str | None = None):
     """Return a `pandas.DataFrame` of a trajectory: see `Trajectory.to_pandas`."""
     pandas = import_package("to_pandas()", "pandas", "pandas")
     require_numbers(trajectory, "to_pandas() copies")

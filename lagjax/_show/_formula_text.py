@@ -80,7 +80,7 @@ LATEX = Style(
 
 
 class FormulaWriter:
-    """Writes sums of `formulas` in a style, with `names` of inputs; `parts` are atoms written by their own name."""
+    """Writes sums of `formulas` as text in a style; `names` of inputs, `parts` are atoms with names of their own."""
 
     def __init__(self, formulas: Formulas, names: Sequence[Name], style: Style, parts: dict[int, str]):
         self.formulas, self.names, self.style, self.parts = formulas, names, style, parts

@@ -21,7 +21,7 @@ COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#00
 _SIZE, _DPI = (5.2, 1.9), 144  # inches, and the dots of a fine screen
 
 
-def cell(text: str, draw: Callable[[Any], None], size: tuple[float, float] = _SIZE) -> str | None:
+def html_cell(text: str, draw: Callable[[Any], None], size: tuple[float, float] = _SIZE) -> str | None:
     """Return HTML with a text and the picture that `draw(figure)` makes beneath it; None if drawing fails."""
     try:
         image = render_picture(size, draw)
@@ -48,7 +48,7 @@ def trajectory_html(trajectory) -> str | None:
     leaves = [*jax.tree.leaves(trajectory.q), trajectory.ts, trajectory.result._value, trajectory.end.t]
     if not all(map(is_known, leaves)) or not leaves[0].size:
         return None
-    return cell(repr(trajectory), lambda figure: _draw_curves(figure, trajectory))
+    return html_cell(repr(trajectory), lambda figure: _draw_curves(figure, trajectory))
 
 
 def _draw_curves(figure, trajectory) -> None:

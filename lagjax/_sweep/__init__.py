@@ -29,16 +29,23 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax._interface import output_times, require_flag
-from lagjax._run.hybrid import Hybrid, Scene, jumps, require_scene
+from lagjax._run.hybrid import Hybrid, Scene, may_jump, require_scene
 from lagjax._show import import_package
-from lagjax._sweep._begin import begin, resume
+from lagjax._sweep._begin import check_store, create_store
 from lagjax._sweep._description import Description, Sections, uses_doubles
 from lagjax._sweep._files import NOT_DONE, RESULT, Files
-from lagjax._sweep._job import Job, precision
+from lagjax._sweep._job import Job, set_precision
 from lagjax._sweep._members import axes_of
-from lagjax._sweep._statistics import Statistics, Summary, from_bytes, merge, summary
-from lagjax._sweep._status import Progress, Status, status
-from lagjax._sweep._workers import require_executor, require_part, run_store, submit, units_to_compute, work
+from lagjax._sweep._statistics import Statistics, Summary, merge_statistics, statistics_from_bytes, summarize
+from lagjax._sweep._status import Progress, Status, read_status
+from lagjax._sweep._workers import (
+    compute_units,
+    require_executor,
+    require_part,
+    run_store,
+    submit_units,
+    units_to_compute,
+)
 
 
 @dataclass(frozen=True)
@@ -122,23 +129,23 @@ class Sweep:
         for text in damaged.values():
             warnings.warn(f"{self.store}: {text}. Run the sweep again: it computes them again.", stacklevel=2)
         result = data[RESULT.name].load()  # attributes and coordinates stay
-        for unit in set(range(store.grid(spec).units)) & set(damaged):
+        for unit in set(range(store.grid(spec).unit_count)) & set(damaged):
             result.values[store.grid(spec).box(unit)] = NOT_DONE
         return data.assign({RESULT.name: result})
 
     def status(self) -> Status:
         """The progress: units that are done, the ends of members, those that failed, and the worst change of energy."""
-        return status(Files(self.store))
+        return read_status(Files(self.store))
 
     def statistics(self) -> dict[str, Summary]:
         """The statistics named in `reduce` over all finished units, by the names of the quantities."""
         store = Files(self.store)
         spec, totals = store.spec(), {}
         for unit in sorted(store.finished_units()) if spec["reduce"] else ():
-            for name, part in from_bytes(store.statistics(unit)).items():
-                totals[name] = merge(totals.get(name), part)
+            for name, part in statistics_from_bytes(store.statistics(unit)).items():
+                totals[name] = merge_statistics(totals.get(name), part)
         shapes = {q["name"]: tuple(q["shape"]) for q in spec["kept"]}
-        return {name: summary(Statistics(**spec["reduce"][name]), x, shapes[name]) for name, x in totals.items()}
+        return {name: summarize(Statistics(**spec["reduce"][name]), x, shapes[name]) for name, x in totals.items()}
 
     def damaged(self) -> dict[int, str]:
         """The damage of finished units, in words by units. All are read; the next run computes these again."""
@@ -241,7 +248,7 @@ def sweep(
     settled = store if isinstance(store, Store) else Store(store)
     settings = {name: getattr(settled, name) for name in ("rtol", "atol", "max_steps", "event", "solver")}
     given = [name for name in ("event", "crossings", "solver") if getattr(settled, name) is not None]
-    if given and jumps(system):
+    if given and may_jump(system):
         raise ValueError(
             f"{' and '.join(given)} of sweep: for the motion of one System without contacts. Transitions watch a "
             "hybrid motion, in machine code; one without a reset notes where it is crossed, and "
@@ -265,17 +272,17 @@ def sweep(
     axes, part = axes_of(over), require_part(settled.part)
     place, compiled = _store_folder(settled.path, "store"), []
     other = None if settled.extend is None else _store_folder(settled.extend, "extend")
-    with precision(uses_doubles()):
+    with set_precision(uses_doubles()):
         if not place.exists():
-            begin(place, axes, description, settled.unit, compiled, other)
+            create_store(place, axes, description, settled.unit, compiled, other)
         spec = place.spec()
-        description = resume(place, spec, axes, description, other)
+        description = check_store(place, spec, axes, description, other)
         job = Job.from_store(place, spec, description, *compiled)
         show, units = Progress(place, spec, progress), units_to_compute(job, part)
         if executor is not None:
-            submit(job, units, executor, show)
+            submit_units(job, units, executor, show)
         else:
-            work(job, units, show)
+            compute_units(job, units, show)
     show.end()
     return Sweep(place.path)
 

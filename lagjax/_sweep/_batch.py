@@ -19,11 +19,11 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax._engine import Batch, Solution, axes_per_leaf
-from lagjax._engine.taylor import MachineCode, Noted, flow_of, tolerances_of
+from lagjax._engine.taylor import FoundCrossings, MachineCode, flow_of, tolerances_of
 from lagjax._equations import has_constraints
 from lagjax._interface import RESULTS, SUCCESSFUL, as_arrays, code_of, name_of, result_from
 from lagjax._run import Trajectory, restore_crossings, sections_of, simulate, simulate_batch, surfaces_in, trajectory_of
-from lagjax._run.hybrid import Hybrid, jumps
+from lagjax._run.hybrid import Hybrid, may_jump
 from lagjax._sweep._description import NOT_TRACEABLE, Description, Sections
 from lagjax._sweep._files import RESULT, Quantity
 
@@ -37,7 +37,7 @@ PATH_BYTES = 64 * 2**20  # of the path of a batch
 _RAISED = re.compile(r"[\w.]+(Error|Exception|Warning|Interrupt): ")
 
 
-def label(code: int) -> str:
+def result_name(code: int) -> str:
     return NAMES.get(code) or name_of(code)
 
 
@@ -52,7 +52,7 @@ class KeptResults(NamedTuple):
 
 
 class Batches:
-    """Computes batches of one sweep; what it compiles it keeps."""
+    """Simulates batches of a sweep's members, and keeps the compiled programs."""
 
     def __init__(self, description: Description, conserves: bool):
         self.description, self.conserves = description, conserves
@@ -69,9 +69,9 @@ class Batches:
             )
         if callable(roles["ts"]) and not callable(roles["q0"]):
             roles["q0"] = lambda _: description.q0  # each member has a start, as it has times
-        self._starts = {role: self._map_start(role, f) if callable(f) else None for role, f in roles.items()}
+        self._starts = {role: self._vectorize_start(role, f) if callable(f) else None for role, f in roles.items()}
         self._axes = tuple(0 if self._starts[role] else None for role in ("q0", "qdot0", "params"))
-        self._keep_all, self._keep_one = jax.jit(self._keep_vectorized), jax.jit(self._keep_member)
+        self._keep_all, self._keep_one = jax.jit(self._keep_members), jax.jit(self._keep_member)
         self._drift_all, self._tolerances = jax.jit(jax.vmap(self._energy_drift, in_axes=(0, self._axes[2]))), None
         self._settings = None
 
@@ -95,14 +95,14 @@ class Batches:
         """The bytes that are kept of a member, of the first of these; 0 where `keep` fails for that one."""
         motions, *_ = self._compute_motions({name: x[:1] for name, x in points.items()})
         try:
-            kept, _ = jax.eval_shape(self._keep_vectorized, motions.arrays, motions.params)
+            kept, _ = jax.eval_shape(self._keep_members, motions.arrays, motions.params)
             return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(kept))
         except NOT_TRACEABLE:
-            (row,), _ = self._member_rows(motions)
+            (row,), _ = self._call_keep(motions)
             return sum(x.nbytes for x in (row or {}).values())
 
     def _compute_motions(self, points: dict[str, np.ndarray]) -> tuple["_BatchMotions", dict[int, str], dict[int, str]]:
-        """The motions, and complaints by members: about their starts, and about times that are none."""
+        """The motions at points (B,), and {member: sentence} on failed starts, then on wrong output times."""
         description, complaints, wrong = self.description, {}, {}
         starts = self._starts.items()
         values = {role: f(points, complaints) if f else getattr(description, role) for role, f in starts}
@@ -110,13 +110,13 @@ class Batches:
         if self._starts["ts"]:
             ts, wrong = _replace_bad_times(ts, complaints)
         run, crossings = run_batch(description, values, jnp.asarray(ts), self._axes)
-        self._tolerances, self._settings = None if jumps(description.system) else run.tolerances, run.settings
+        self._tolerances, self._settings = None if may_jump(description.system) else run.tolerances, run.settings
         for_members = values["params"] if self._axes[2] == 0 else None
         of_run = _result_arrays(run) | ({"ts": ts} if self._starts["ts"] else {})
         return _BatchMotions(run, (of_run, crossings), for_members), complaints, wrong
 
     def _keep_results(self, motions: "_BatchMotions") -> _Kept:
-        """The result of `keep` for each member, the change of its energy, and the members for which `keep` raised."""
+        """The results of `keep` for every member, |h − h₀| (B,), and {member: sentence} for those where it raised."""
         if "keep" not in self.slow:
             try:
                 kept, drift = self._keep_all(motions.arrays, motions.params)
@@ -134,8 +134,8 @@ class Batches:
 
     # ---- compiled for all members ----
 
-    def _map_start(self, role: str, function: Callable) -> Callable:
-        """`function(point)` for points (B,) of all members; why it raised for some is added to `complaints`."""
+    def _vectorize_start(self, role: str, function: Callable) -> Callable:
+        """`start(points, complaints)`: `function` at points (B,); members that raise get a complaint."""
         compiled = jax.jit(jax.vmap(function))
 
         def start(points, complaints):
@@ -148,18 +148,19 @@ class Batches:
 
         return start
 
-    def _keep_vectorized(self, arrays: tuple, params: PyTree) -> tuple:
+    def _keep_members(self, arrays: tuple, params: PyTree) -> tuple:
         keep_member = lambda *of: (self._keep_member(*of), self._energy_drift(*of))  # noqa: E731
         return jax.vmap(keep_member, in_axes=(0, self._axes[2]))(arrays, params)
 
     def _keep_member(self, arrays: tuple, params: PyTree) -> dict:
         run, crossings = arrays
         extras = {} if self.description.sections is None else {"crossings": crossings}
-        kept = self.description.keep(self._simulate_members(run, params), **extras)
+        kept = self.description.keep(self._member_trajectory(run, params), **extras)
         _require_dict(kept)
         return kept
 
-    def _simulate_members(self, arrays: dict, params: PyTree) -> Trajectory:
+    def _member_trajectory(self, arrays: dict, params: PyTree) -> Trajectory:
+        """The `Trajectory` of one member, as `keep` takes it, from its arrays."""
         scene, code, ts = self.description.system, arrays["code"], arrays.get("ts", self.description.ts)
         modes = dict(scene.modes) if isinstance(scene, Hybrid) else None
         return Trajectory.from_fields(
@@ -172,8 +173,8 @@ class Batches:
 
     def _energy_drift(self, arrays: tuple, params: PyTree):
         """|h − h₀| of a member from the first output to the end."""
-        scene, run = self.description.system, self._simulate_members(arrays[0], params)
-        if not self.conserves or isinstance(scene, Hybrid) or jumps(scene):
+        scene, run = self.description.system, self._member_trajectory(arrays[0], params)
+        if not self.conserves or isinstance(scene, Hybrid) or may_jump(scene):
             return None
         q, qdot = jax.tree.map(lambda x: x[0], (run.q, run.qdot))
         energy, end = scene.energy, run.end
@@ -182,14 +183,14 @@ class Batches:
     # ---- member by member ----
 
     def _keep_one_by_one(self, motions: "_BatchMotions") -> tuple[dict[str, np.ndarray], dict[int, str]]:
-        """The result of `keep` for each member, one after the other; and the complaints about these results."""
-        rows, errors = self._member_rows(motions)
+        """The results of `keep`, called member by member, (B, …) by name; and {member: sentence} where it failed."""
+        rows, errors = self._call_keep(motions)
         if not self.quantities and not any(rows):
             raise errors[0]  # at the first look, of all members
         complaints = {k: f"keep raised {_describe_error(error)}" for k, error in errors.items()}
         expected = self.quantities or _common_quantities([row for row in rows if row])
         for k, row in enumerate(rows):
-            if row is not None and (wrong := _explain_misfit(expected, row)):
+            if row is not None and (wrong := _explain_mismatch(expected, row)):
                 rows[k], complaints[k] = None, wrong
         kept = {q.name: np.full((len(rows), *q.shape), q.filling, q.dtype) for q in expected}
         for k, row in enumerate(rows):
@@ -197,7 +198,8 @@ class Batches:
                 kept[name][k] = x
         return kept, complaints
 
-    def _member_rows(self, motions: "_BatchMotions") -> tuple[list[dict[str, np.ndarray] | None], dict[int, Exception]]:
+    def _call_keep(self, motions: "_BatchMotions") -> tuple[list[dict[str, np.ndarray] | None], dict[int, Exception]]:
+        """The dict that `keep` returns for each member, None where it raised; and {member: exception}."""
         of_all = jax.tree.map(np.asarray, (*motions.arrays, motions.params))
         keep_member = self._keep_member if "keep" in self.slow else self._keep_one
 
@@ -209,7 +211,7 @@ class Batches:
 
 
 class _BatchMotions(NamedTuple):
-    """Motions of a batch, the arrays of B members in these and in their crossings, and params that differ by member."""
+    """The motions of a batch; the arrays of B members (trajectories, crossings); params that differ by member."""
 
     run: Trajectory
     arrays: tuple
@@ -217,7 +219,7 @@ class _BatchMotions(NamedTuple):
 
 
 def _replace_bad_times(ts: np.ndarray, complaints: dict[int, str]) -> tuple[np.ndarray, dict[int, str]]:
-    """Times (B, T), in place of those that cannot be followed any others; and what is wrong with these, by members."""
+    """Times (B, T) with invalid rows replaced by a valid one; and {member: sentence} for those."""
     steps = np.diff(ts, axis=1)
     is_sound: Any = np.isfinite(ts).all(axis=1) & ((steps > 0).all(axis=1) | (steps < 0).all(axis=1))
     reason = "ts returned times that are not finite, or neither increase nor decrease"
@@ -227,7 +229,7 @@ def _replace_bad_times(ts: np.ndarray, complaints: dict[int, str]) -> tuple[np.n
 
 
 def _start_one_by_one(role: str, function: Callable, points: dict[str, np.ndarray], complaints: dict[int, str]):
-    """`function(point)` called with numbers for each member; NaN, and the complaint, where it raises."""
+    """`function(point)` member by member; NaN where it raises, with a sentence in `complaints`."""
 
     def start(k: int) -> PyTree:
         return jax.tree.map(lambda x: np.asarray(x, float), function({name: float(x[k]) for name, x in points.items()}))
@@ -242,7 +244,7 @@ def _start_one_by_one(role: str, function: Callable, points: dict[str, np.ndarra
 
 
 def _call_each(function: Callable[[int], Any], count: int) -> tuple[list[Any], dict[int, Exception]]:
-    """The results of a user's function for each member, None where it raised: that one is lost; and the exceptions."""
+    """The results of `function(k)` for k < count, None where it raised; and {k: exception}."""
     rows, errors = [None] * count, {}
     for k in range(count):
         try:
@@ -253,7 +255,7 @@ def _call_each(function: Callable[[int], Any], count: int) -> tuple[list[Any], d
 
 
 def _common_quantities(rows: list[dict[str, np.ndarray]]) -> list[Quantity]:
-    """The quantities of the first member, each of the type that holds what all keep (1 and 1.5 are floats), if any."""
+    """The kept quantities, named as by the first member, each with the dtype that holds the values of all."""
     common = []
     for name, first in rows[0].items():
         dtype = first.dtype
@@ -267,13 +269,14 @@ _KEPT = ("q", "qdot", "end", "mode", "transitions", "impacts", "contacts", "cont
 
 
 def _result_arrays(run: Trajectory) -> dict[str, Any]:
+    """The fields of a batch's trajectory that `keep` may read, by name, as arrays with the members first."""
     fields = {name: getattr(run, name) for name in _KEPT}
     fields |= {name: _fill_record(fields[name]) for name in ("impacts", "contact_changes") if fields[name] is not None}
     return fields | {"code": run.result._value, "stats": {k: x for k, x in run.stats.items() if jnp.ndim(x)}}
 
 
 def _fill_record(record: Any) -> Any:
-    """The `Impacts` or `ContactChanges` of a batch, (B, N, …), with the room that all batches have."""
+    """`Impacts` or `ContactChanges` (B, N, …) padded to N = `MOST_CONTACT_CHANGES`, so that batches agree."""
 
     def fill(x):
         widths = [(0, 0), (0, MOST_CONTACT_CHANGES - x.shape[1]), *[(0, 0)] * (jnp.ndim(x) - 2)]
@@ -283,7 +286,8 @@ def _fill_record(record: Any) -> Any:
     return record._replace(**jax.tree.map(fill, parts))
 
 
-def _explain_misfit(expected: list[Quantity], row: dict[str, np.ndarray]) -> str | None:
+def _explain_mismatch(expected: list[Quantity], row: dict[str, np.ndarray]) -> str | None:
+    """A sentence if a member's kept values differ in name, shape or type from the expected ones; else None."""
     names = [q.name for q in expected]
     if names != list(row):
         return f"keep returned {list(row)}, of other members {names}"
@@ -301,7 +305,7 @@ def _require_dict(kept: Any) -> None:
             "keep must return a dict that is not empty: names with numbers or arrays, such as {'angle': "
             f"trajectory.q[-1]}}; it returned {type(kept).__name__ if not isinstance(kept, dict) else kept}."
         )
-    names = jax.tree.leaves(names_of(kept))
+    names = jax.tree.leaves(leaf_names(kept))
     for name, leaf in zip(names, jax.tree.leaves(kept), strict=True):
         if names.count(name) > 1:
             raise ValueError(f"keep returns two quantities with the name {name!r} in the store: rename one of them.")
@@ -312,10 +316,10 @@ def _require_dict(kept: Any) -> None:
 
 
 def _arrays_by_name(kept: dict) -> dict[str, np.ndarray]:
-    return dict(zip(jax.tree.leaves(names_of(kept)), map(np.asarray, jax.tree.leaves(kept)), strict=True))
+    return dict(zip(jax.tree.leaves(leaf_names(kept)), map(np.asarray, jax.tree.leaves(kept)), strict=True))
 
 
-def names_of(kept: dict) -> dict:
+def leaf_names(kept: dict) -> dict:
     key = lambda path, _: jax.tree_util.keystr(path, simple=True, separator=".")  # noqa: E731
     return jax.tree_util.tree_map_with_path(key, kept)
 
@@ -325,7 +329,7 @@ def _first_line(error: BaseException) -> str:
 
 
 def _describe_error(error: Exception) -> str:
-    """The type and the first line of an error; of one that a callback raised, its line in all that XLA says."""
+    """The type and first line of an error; for one raised in a callback, its line within XLA's message."""
     lines = (line.strip() for line in reversed(str(error).split("\n")))
     said = next((line for line in lines if _RAISED.match(line)), None)
     return f"{type(error).__name__}: {_first_line(error)}" if said is None else said[:200]
@@ -347,7 +351,7 @@ def run_batch(description: Description, values: dict[str, PyTree], ts, axes: tup
     are q0, qdot0 and params by name, `axes` their `batch_axes`."""
     system, settings, sections = description.system, description.settings, description.sections
     q0, qdot0, params = values.values()
-    if jumps(system):
+    if may_jump(system):
         tolerances = {name: settings[name] for name in ("rtol", "atol", "max_steps")}
         of_times = None if ts.ndim == 1 else 0
         return _hybrid_batch(system, (*axes[:2], of_times, axes[2]), **tolerances)(q0, qdot0, ts, params), None
@@ -356,7 +360,7 @@ def run_batch(description: Description, values: dict[str, PyTree], ts, axes: tup
     of_leaves, size = axes_per_leaf(values, axes)
     tolerances = (settings[name] for name in ("rtol", "atol", "max_steps"))
     batch = Batch.from_values(system, values, of_leaves, size, ts, *tolerances)
-    solution, noted = _follow_crossings(batch, sections)
+    solution, noted = _find_crossings(batch, sections)
     if len(ts) == 2 and not has_constraints(system):
         params, reached = as_arrays(params, batch.member.layout.dtype), (solution.result == SUCCESSFUL)[:, None]
         ends = np.stack([np.asarray(batch.y0), np.where(reached, solution.y_end, np.nan)], axis=1)  # at both times
@@ -365,13 +369,13 @@ def run_batch(description: Description, values: dict[str, PyTree], ts, axes: tup
         run = simulate_batch(system, q0, qdot0, ts, params, batch_axes=axes, **settings)
         starts = np.asarray(run.result._value) != _INCONSISTENT  # others are not followed, and cross nothing
         t, y = np.where(starts[:, None], noted.t, np.nan), np.where(starts[:, None, None], noted.y, np.nan)
-        noted = Noted(t, y, np.where(starts, noted.count, 0))
+        noted = FoundCrossings(t, y, np.where(starts, noted.count, 0))
     ok = (solution.result == SUCCESSFUL) & (noted.count <= sections.count)
     return run, restore_crossings(batch.member.layout, sections.names, noted, ok)
 
 
-def _follow_crossings(batch: Batch, sections: Sections) -> tuple[Solution, Noted]:
-    """The motions from the first to the last time, and the crossings of G sections, each with that axis in front."""
+def _find_crossings(batch: Batch, sections: Sections) -> tuple[Solution, FoundCrossings]:
+    """The motions of a batch, and the crossings of G sections, (G, B, …)."""
     section = sections.named_functions() if sections.names else sections.functions[0]
     surfaces = surfaces_in(batch.member, sections_of(section)[1], sections.directions, sections.names)
     problem = dataclasses.replace(batch.member, guards=surfaces.guards(notes=True))
@@ -380,4 +384,4 @@ def _follow_crossings(batch: Batch, sections: Sections) -> tuple[Solution, Noted
     solution = flow_of(problem).run(ts, y0, params, tolerances)
     path = solution.path.reshape(len(y0), len(sections.functions), sections.count + 1, -1)
     rows = np.moveaxis(path, 1, 0)
-    return solution, Noted(rows[:, :, :-1, 0], rows[:, :, :-1, 1:], rows[:, :, -1, 0])
+    return solution, FoundCrossings(rows[:, :, :-1, 0], rows[:, :, :-1, 1:], rows[:, :, -1, 0])

@@ -1,4 +1,4 @@
-"""`begin` creates a store; `resume` checks the description of an existing one."""
+"""`create_store` creates a store; `check_store` checks the description of an existing one."""
 
 import math
 import time
@@ -10,11 +10,11 @@ import numpy as np
 from lagjax._interface import RESULTS, Layout, code_of
 from lagjax._run.hybrid import Hybrid
 from lagjax._sweep import _batch
-from lagjax._sweep._batch import Batches, KeptResults, label
+from lagjax._sweep._batch import Batches, KeptResults, result_name
 from lagjax._sweep._description import Description, compared_entries, differences, pack_description, users_path
-from lagjax._sweep._extend import LaterEnd, continues, copy_members, later_end_of, require_extensible, start_names
+from lagjax._sweep._extend import LaterEnd, continues_store, copy_members, later_end_of, require_extensible, start_names
 from lagjax._sweep._files import FORMAT, NOT_DONE, RESULT, Files, Quantity, is_file_name
-from lagjax._sweep._job import cpu, require_versions, versions
+from lagjax._sweep._job import cpu_kind, package_versions, require_versions
 from lagjax._sweep._members import RESERVED, Axis, Grid, points_of
 from lagjax.designs import Design
 
@@ -51,7 +51,7 @@ def _thin_points(points: dict[str, np.ndarray], most: int) -> dict[str, np.ndarr
     return {name: x[:: -(-len(x) // max(1, most))] for name, x in points.items()}
 
 
-def begin(
+def create_store(
     store: Files,
     axes: tuple[Axis, ...],
     description: Description,
@@ -74,7 +74,7 @@ def begin(
     _require_names(quantities, axes, description.reduce)
     most = _batch.MOST_MEMBERS if kept.engine == "MachineCode" else _batch.MOST_ON_DEVICES
     spec = {
-        "format": FORMAT, "versions": versions(), "cpu": cpu(), "engine": kept.engine, "shape": shape,
+        "format": FORMAT, "versions": package_versions(), "cpu": cpu_kind(), "engine": kept.engine, "shape": shape,
         "chunk": Grid.from_shape(shape, _choose_unit_size(unit, shape, seconds, quantities)).chunk,
         "batch": max(1, min(most, _members_in_memory(description, points))), "seconds_per_member": seconds,
         "kept": [{"name": q.name, "shape": q.shape, "dtype": q.dtype.str} for q in quantities], "conserves": conserves,
@@ -84,11 +84,11 @@ def begin(
     if other is not None and later is None:
         require_extensible(other, spec)
     codes = sorted({code_of(item) for item in RESULTS._name_to_item.values()} | set(_batch.NAMES))
-    codes = {NOT_DONE: "not_done"} | {code: label(code) for code in codes}
+    codes = {NOT_DONE: "not_done"} | {code: result_name(code) for code in codes}
     with store.create_aside() as new:
         new.create(spec, scene, axes, f"lagjax sweep over {', '.join(names)}", codes)
         if later is not None:
-            later.copy(new)
+            later.copy_starts(new)
         elif other is not None:
             copy_members(other, new)
 
@@ -153,7 +153,7 @@ def _require_names(quantities: list[Quantity], axes: tuple[Axis, ...], reduce: d
 # ---- a store that is there -------------------------------------------------------------------------------------------
 
 
-def resume(
+def check_store(
     store: Files, spec: dict, axes: tuple[Axis, ...], description: Description, other: Files | None
 ) -> Description:
     """Return the description with the names of the store's starts; raise `ValueError` naming what differs."""
@@ -161,7 +161,7 @@ def resume(
     here = compared_entries(axes, description) | {"continues": None}
     if other is not None and not other.exists():  # all that is needed of it was copied
         here["continues"] = spec["continues"]
-    elif other is not None and continues(other, description):
+    elif other is not None and continues_store(other, description):
         here["continues"] = other.identity()
     if lines := differences(spec, here, here):
         raise ValueError(

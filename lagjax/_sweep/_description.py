@@ -23,7 +23,7 @@ from jaxtyping import PyTree
 
 from lagjax._engine.taylor import MachineCode
 from lagjax._interface import accept, output_times, require_budget
-from lagjax._interface.reads import array_text, hash_of, identity, source, strip_addresses
+from lagjax._interface.reads import array_text, hash_of, identity, source_text, strip_addresses
 from lagjax._run import directions_of, sections_of
 from lagjax._run.hybrid import Hybrid, Scene
 from lagjax._scene import ARGUMENTS, ROLES
@@ -159,7 +159,7 @@ def uses_doubles() -> bool:
 # ---- text and hash ---------------------------------------------------------------------------------------------------
 
 
-def texts(description: Description, names: list[str]) -> dict[str, dict[str, str]]:
+def describe_functions(description: Description, names: list[str]) -> dict[str, dict[str, str]]:
     """Return the text of every function and value, and its jaxpr as text (its code where JAX cannot trace it)."""
     point = {name: jnp.zeros(()) for name in names}
     q, qdot, params = description.shapes(names)
@@ -205,7 +205,7 @@ def _defer_trace(function, arguments: tuple, params) -> Callable:
 
 def _entry(value: Any, program: Callable | None, *more: Any) -> dict[str, str]:
     """Return {"text", "program"} of a function or value: the program is its jaxpr, else its code and all it uses."""
-    text = source(value) if callable(value) else _value_text(value)
+    text = source_text(value) if callable(value) else _value_text(value)
     try:
         closed = program() if program else None
     except Exception:  # not written in jax.numpy, or it needs leaves that are no numbers
@@ -245,7 +245,7 @@ def compared_entries(axes: tuple[Axis, ...], description: Description) -> dict:
     """Return the entries of a store's description that are compared, as JSON stores them."""
     names = [name for axis in axes for name in axis.names]
     entries = {"axes": [axis.described() for axis in axes], "x64": uses_doubles(), **description.described()}
-    return json.loads(json.dumps(entries | {"scene": texts(description, names)}))
+    return json.loads(json.dumps(entries | {"scene": describe_functions(description, names)}))
 
 
 def differences(spec: dict, here: dict, entries: Iterable[str], roles: Iterable[str] | None = None) -> list[str]:

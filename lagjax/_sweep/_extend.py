@@ -23,7 +23,7 @@ import numpy as np
 from lagjax._interface import SUCCESSFUL
 from lagjax._run import State
 from lagjax._run.hybrid import Hybrid
-from lagjax._sweep._batch import names_of
+from lagjax._sweep._batch import leaf_names
 from lagjax._sweep._description import MOTION, Description, FinalStates, compared_entries, differences
 from lagjax._sweep._files import RESULT, Copied, Files
 from lagjax._sweep._job import require_versions
@@ -68,7 +68,7 @@ def copy_members(old: Files, new: Files) -> None:
             stacklevel=4,
         )
         return
-    for unit in range(grid.units):
+    for unit in range(grid.unit_count):
         box = [places_in(part) for places_in, part in zip(places, grid.box(unit), strict=True)]
         inside = [np.flatnonzero(x >= 0) for x in box]
         if not all(len(x) for x in inside):
@@ -106,7 +106,7 @@ def _read_members(old: Files, spec: dict, places: list[np.ndarray]) -> dict[str,
 
 
 class LaterEnd(NamedTuple):
-    """The last states in a store, from which motions continue: their name there, and the names of their leaves."""
+    """The last states in another store, where motions continue: their name there, and the names of their leaves."""
 
     store: Files
     end: str
@@ -121,23 +121,23 @@ class LaterEnd(NamedTuple):
             x[result != SUCCESSFUL] = np.nan
         return dict(zip(names[:-1], states, strict=True)), result
 
-    def copy(self, new: Files) -> None:
+    def copy_starts(self, new: Files) -> None:
         """Write the states as starts of the members of a new store; members that ended keep their result."""
         grid = new.grid(new.spec())
-        for unit in range(grid.units):
+        for unit in range(grid.unit_count):
             states, result = self.read(grid.box(unit))
             ended = np.flatnonzero(result != SUCCESSFUL)
             new.write_copied(unit, Copied(ended, {RESULT.name: result[ended]}, states))
 
 
-def continues(other: Files, description: Description) -> bool:
+def continues_store(other: Files, description: Description) -> bool:
     shared = other.spec()["ts"]
     return shared is not None and float(description.ts[0]) == shared["ends"][1]
 
 
 def later_end_of(other: Files, axes: tuple[Axis, ...], description: Description) -> LaterEnd | None:
     """Return the last states that these motions continue, None if they do not; raise if they cannot."""
-    if not continues(other, description):
+    if not continues_store(other, description):
         return None
     if isinstance(description.system, Hybrid):
         raise ValueError(
@@ -149,7 +149,7 @@ def later_end_of(other: Files, axes: tuple[Axis, ...], description: Description)
     if lines := differences(spec, compared_entries(axes, description), ("axes", "x64", "scene"), MOTION):
         said = f"{other.path} has motions of another description, which cannot continue. What differs:"
         raise ValueError("\n".join([said, *lines]))
-    if missing := other.grid(spec).units - len(other.finished_units()):
+    if missing := other.grid(spec).unit_count - len(other.finished_units()):
         raise ValueError(f"{other.path}: {missing} units are not done; motions can continue when they are.")
     names = [name for axis in spec["axes"] for name in axis["names"]]
     shapes, state = {x.name: x.shape for x in other.quantities(spec)}, description.shapes(names)[:2]
@@ -167,5 +167,5 @@ def later_end_of(other: Files, axes: tuple[Axis, ...], description: Description)
 def start_names(description: Description, names: list[str], end: str) -> FinalStates:
     """Return the names of the starts of continued motions, whose ends another store has by the name `end`."""
     q, qdot, _ = description.shapes(names)
-    state = names_of({end: State(jnp.zeros(()), q, qdot)})[end]
+    state = leaf_names({end: State(jnp.zeros(()), q, qdot)})[end]
     return FinalStates(state.q, state.qdot)

@@ -254,7 +254,7 @@ class Files:
     def statistics(self, unit: int) -> bytes:
         return (self.job / "done" / f"{unit}.npz").read_bytes()
 
-    def copied(self, unit: int) -> Copied:
+    def read_copied(self, unit: int) -> Copied:
         file = self.job / "copied" / f"{unit}.npz"
         if not file.exists():
             return Copied(np.zeros(0, int), {}, {})
@@ -284,11 +284,11 @@ class Files:
         """Return the path at which zarr looks for the chunk of a unit."""
         return self.path / q.name / "c" / "/".join(map(str, grid.place(unit) + (0,) * len(q.shape)))
 
-    def undo(self, spec: dict, unit: int) -> None:
+    def mark_undone(self, spec: dict, unit: int) -> None:
         """Mark a unit as not done, also for those who read `result`."""
         with self.explain_errors(f"unit {unit} is damaged, and stays so"):
             (self.job / "done" / f"{unit}.json").unlink(missing_ok=True)
-            if unit < self.grid(spec).units:
+            if unit < self.grid(spec).unit_count:
                 self.chunk_file(self.grid(spec), unit, RESULT).unlink(missing_ok=True)
 
     def find_damage(self, spec: dict, units: Iterable[int], whole: bool = False) -> dict[int, str]:
@@ -302,8 +302,8 @@ class Files:
 
     def _describe_damage(self, spec: dict, whole: bool, unit: int) -> str | None:
         grid = self.grid(spec)
-        if unit >= grid.units:
-            return f"unit {unit}: there are but {grid.units} units"
+        if unit >= grid.unit_count:
+            return f"unit {unit}: there are but {grid.unit_count} units"
         try:
             hashes = self.record(unit)["sha256"]
         except (ValueError, OSError):

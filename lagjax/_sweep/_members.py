@@ -131,20 +131,20 @@ class Grid:
         return cls(tuple(shape), tuple(chunk))
 
     @property
-    def members(self) -> int:
+    def member_count(self) -> int:
         return math.prod(self.shape)
 
     @property
-    def tiles(self) -> tuple[int, ...]:
+    def units_per_axis(self) -> tuple[int, ...]:
         return tuple(math.ceil(size / part) for size, part in zip(self.shape, self.chunk, strict=True))
 
     @property
-    def units(self) -> int:
-        return math.prod(self.tiles)
+    def unit_count(self) -> int:
+        return math.prod(self.units_per_axis)
 
     def place(self, unit: int) -> tuple[int, ...]:
         """Return the index of a unit among the units, which names its chunk."""
-        return tuple(int(i) for i in np.unravel_index(unit, self.tiles))
+        return tuple(int(i) for i in np.unravel_index(unit, self.units_per_axis))
 
     def box(self, unit: int) -> tuple[slice, ...]:
         parts = zip(self.place(unit), self.chunk, self.shape, strict=True)
@@ -153,11 +153,11 @@ class Grid:
     def box_shape(self, unit: int) -> tuple[int, ...]:
         return tuple(s.stop - s.start for s in self.box(unit))
 
-    def size(self, unit: int) -> int:
+    def unit_size(self, unit: int) -> int:
         return math.prod(self.box_shape(unit))
 
     def numbers(self, unit: int, which: np.ndarray) -> np.ndarray:
-        """Return the numbers in the whole sweep of the members `which` of a unit."""
+        """Return the numbers, in the whole sweep, of the members with indices `which` in a unit."""
         inside = np.unravel_index(which, self.box_shape(unit))
         places = [i + s.start for i, s in zip(inside, self.box(unit), strict=True)]
         return np.asarray(np.ravel_multi_index(places, self.shape))
@@ -169,6 +169,6 @@ def points_of(axes: list[dict[str, np.ndarray]], shape: tuple[int, ...], which: 
     return {name: values[i] for i, axis in zip(places, axes, strict=True) for name, values in axis.items()}
 
 
-def text_of(point: dict[str, Any]) -> str:
+def point_text(point: dict[str, Any]) -> str:
     """Return a point as text, 'l = 0.5, theta = 1.2', with all digits, so that it can be run again."""
     return ", ".join(f"{name} = {float(value)!r}" for name, value in point.items())

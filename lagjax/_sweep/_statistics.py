@@ -96,8 +96,8 @@ class Summary(NamedTuple):
     quantiles: np.ndarray | None
 
 
-def partial_of(how: Statistics, values: np.ndarray, ok: np.ndarray, members: np.ndarray) -> Partial:
-    """Return the statistics of a unit: `values` (m, …) of its members, `ok` of each, and their numbers (m,)."""
+def unit_statistics(how: Statistics, values: np.ndarray, ok: np.ndarray, members: np.ndarray) -> Partial:
+    """Return the statistics of a unit from `values` (m, …), flags `ok` (m,), and the members' numbers (m,)."""
     columns = np.ascontiguousarray(values.reshape(len(values), -1).astype(float).T)
     rows = [_summarize_column(how, c, x, ok & np.isfinite(x), members) for c, x in enumerate(columns)]
     *fields, sketches = zip(*rows, strict=True)
@@ -133,7 +133,7 @@ def _bin_centres(bins: np.ndarray) -> np.ndarray:
     return np.where(bins == 0, 0.0, np.sign(bins) * size)
 
 
-def merge(one: Partial | None, two: Partial) -> Partial:
+def merge_statistics(one: Partial | None, two: Partial) -> Partial:
     """Merge the statistics of two sets of members, those of `one` before those of `two`."""
     if one is None:
         return two
@@ -158,7 +158,8 @@ def merge(one: Partial | None, two: Partial) -> Partial:
     )
 
 
-def summary(how: Statistics, total: Partial, shape: tuple[int, ...]) -> Summary:
+def summarize(how: Statistics, total: Partial, shape: tuple[int, ...]) -> Summary:
+    """Return the statistics `how` asks for, in the `shape` of the quantity, from the accumulated `total`."""
     empty = total.count == 0
     with np.errstate(invalid="ignore", divide="ignore"):
         variance = np.where(total.count > 1, total.square / (total.count - 1), np.nan)
@@ -180,12 +181,12 @@ def summary(how: Statistics, total: Partial, shape: tuple[int, ...]) -> Summary:
 # ---- as bytes --------------------------------------------------------------------------------------------------------
 
 
-def to_bytes(partials: dict[str, Partial]) -> bytes:
+def statistics_to_bytes(partials: dict[str, Partial]) -> bytes:
     rows = ((f"{name}/{field}", x) for name, part in partials.items() for field, x in part._asdict().items())
     return arrays_as_bytes(dict(rows))
 
 
-def from_bytes(data: bytes) -> dict[str, Partial]:
+def statistics_from_bytes(data: bytes) -> dict[str, Partial]:
     with np.load(io.BytesIO(data)) as file:
         names = dict.fromkeys(key.rsplit("/", 1)[0] for key in file)
         return {name: Partial(*(file[f"{name}/{field}"] for field in Partial._fields)) for name in names}

@@ -9,7 +9,7 @@ import numpy as np
 
 from lagjax._interface import show_str
 from lagjax._sweep._files import Files
-from lagjax._sweep._members import text_of
+from lagjax._sweep._members import point_text
 
 WELL = ("successful", "event_occurred")
 _RECENT = 32  # units whose times give the rate
@@ -62,18 +62,18 @@ class Status(NamedTuple):
         lines = [f"{self.store}", f"done       {self.done:,} of {self.members:,} members, {self.units_done} of "
                  f"{self.units} units"]  # fmt: skip
         if self.rate is not None and self.left is not None:
-            end = f", {duration(self.left)} left" if self.done < self.members else ""
+            end = f", {duration_text(self.left)} left" if self.done < self.members else ""
             lines.append(f"rate       {self.rate:,.0f} members per second{end}")
         lines += [f"{'results' if not k else '':10} {name} {n:,}" for k, (name, n) in enumerate(self.results.items())]
         for k, f in enumerate(self.failures[:_NAMED]):
             why = f": {f.why}" if f.why else ""
-            lines.append(f"{'failed' if not k else '':10} member {f.member}, {f.result}, at {text_of(f.point)}{why}")
+            lines.append(f"{'failed' if not k else '':10} member {f.member}, {f.result}, at {point_text(f.point)}{why}")
         failed = sum(count for name, count in self.results.items() if name not in WELL)
         if failed > _NAMED:
             lines.append(f"{'':10} and {failed - _NAMED} more")
         if self.drift is not None:
             change, member, point = self.drift
-            lines.append(f"energy     changes by at most {change:.1e}, of member {member}, at {text_of(point)}")
+            lines.append(f"energy     changes by at most {change:.1e}, of member {member}, at {point_text(point)}")
         lines += [f"slow       {name} is called member by member: {why}" for name, why in self.slow.items()]
         for k, text in enumerate(list(self.damaged.values())[:_NAMED]):
             lines.append(f"{'damaged' if not k else '':10} {text}")
@@ -86,7 +86,7 @@ class Status(NamedTuple):
         return "\n".join(lines)
 
 
-def status(store: Files) -> Status:
+def read_status(store: Files) -> Status:
     spec = store.spec()
     store.require_arrays(spec)
     grid, finished = store.grid(spec), store.finished_units()
@@ -95,21 +95,21 @@ def status(store: Files) -> Status:
     records = [store.record(unit) for unit in done]
     results = sum((Counter(record["results"]) for record in records), Counter())
     failed = [row for record in records for row in record["failed"]][:_LISTED]
-    failures = tuple(Failure(number, point(store, spec, number), name, why) for number, name, why in failed)
+    failures = tuple(Failure(number, read_point(store, spec, number), name, why) for number, name, why in failed)
     drifts = [tuple(record["drift"]) for record in records if "drift" in record]
     worst = max(drifts, key=lambda pair: pair[0], default=None)
     members, rate = sum(r["members"] for r in records), _members_per_second(store, done, records)
     slow = {name: why for record in records for name, why in record["slow"].items()}
     return Status(
-        store=str(store.path), done=members, members=grid.members, units_done=len(done), units=grid.units,
+        store=str(store.path), done=members, members=grid.member_count, units_done=len(done), units=grid.unit_count,
         rate=rate,
-        left=None if rate is None else (grid.members - members) / rate, results=dict(results), failures=failures,
-        drift=None if worst is None else (worst[0], worst[1], point(store, spec, worst[1])), slow=slow,
+        left=None if rate is None else (grid.member_count - members) / rate, results=dict(results), failures=failures,
+        drift=None if worst is None else (worst[0], worst[1], read_point(store, spec, worst[1])), slow=slow,
         cpus=tuple(dict.fromkeys(record["cpu"] for record in records if "cpu" in record)), damaged=damaged,
     )  # fmt: skip
 
 
-def point(store: Files, spec: dict, member: int) -> dict[str, float]:
+def read_point(store: Files, spec: dict, member: int) -> dict[str, float]:
     box = tuple(slice(int(i), int(i) + 1) for i in np.unravel_index(member, tuple(spec["shape"])))
     return {name: float(x[0]) for side in store.coordinates(spec["axes"], box) for name, x in side.items()}
 
@@ -126,7 +126,7 @@ def _members_per_second(store: Files, done: list[int], records: list[dict]) -> f
     return sum(record["members"] for _, record in recent[1:]) / (end - begun)
 
 
-def duration(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
@@ -137,7 +137,7 @@ class Progress:
     """Prints the progress on one line of stderr, over and over: done, rate, failures, time left."""
 
     def __init__(self, store: Files, spec: dict, shown: bool):
-        self.store, self.shown, self.members = store, shown, store.grid(spec).members
+        self.store, self.shown, self.members = store, shown, store.grid(spec).member_count
         self._begun, self._counted, self._results, self._last = None, set(), Counter(), 0.0
 
     def __call__(self) -> None:
@@ -153,7 +153,7 @@ class Progress:
         line = f"{done:,} of {self.members:,} members"
         if done > before and now > since:
             rate = (done - before) / (now - since)
-            line += f", {rate:,.0f} per second, {duration((self.members - done) / rate)} left"
+            line += f", {rate:,.0f} per second, {duration_text((self.members - done) / rate)} left"
         line += "".join(f", {count} {name}" for name, count in self._results.items() if name not in WELL)
         print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
 

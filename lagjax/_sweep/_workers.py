@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from lagjax._sweep._files import Files
-from lagjax._sweep._job import Job, compute, open_job, precision
+from lagjax._sweep._job import Job, compute_unit, open_job, set_precision
 
 # ---- units in this process -------------------------------------------------------------------------------------------
 
@@ -42,12 +42,12 @@ def units_to_compute(job: Job, part: slice) -> list[int]:
 
     A finished store may be on a read-only disk.
     """
-    store, chosen = job.store, set(range(job.grid.units)[part])
+    store, chosen = job.store, set(range(job.grid.unit_count)[part])
     store.require_arrays(job.spec)
-    finished = {unit for unit in store.finished_units() if unit in chosen or unit >= job.grid.units}
+    finished = {unit for unit in store.finished_units() if unit in chosen or unit >= job.grid.unit_count}
     damaged = store.find_damage(job.spec, finished, whole=True)
     for unit in damaged:
-        store.undo(job.spec, unit)
+        store.mark_undone(job.spec, unit)
     if damaged:
         first = "; ".join(list(damaged.values())[:_NAMED])
         more = f"; and {len(damaged) - _NAMED} units more" if len(damaged) > _NAMED else ""
@@ -58,13 +58,13 @@ def units_to_compute(job: Job, part: slice) -> list[int]:
     return missing
 
 
-def work(job: Job, units: list[int], notify: Notify = lambda: None) -> int:
-    """Compute and write these units in this process; return how many were not already done by another."""
+def compute_units(job: Job, units: list[int], notify: Notify = lambda: None) -> int:
+    """Compute and write these units in this process; return the number that no other worker had written."""
     count = 0
-    with precision(bool(job.spec["x64"])):
+    with set_precision(bool(job.spec["x64"])):
         for unit in units:
             if not job.store.has_finished(unit):
-                job.store.write_unit(job.spec, unit, *compute(job, unit))
+                job.store.write_unit(job.spec, unit, *compute_unit(job, unit))
                 notify()
                 count += 1
     return count
@@ -74,7 +74,7 @@ def run_store(store: Files, notify: Notify = lambda: None, most: int | None = No
     """Compute at most `most` units of the store at a path; return their number."""
     chosen = require_part(part)
     job = open_job(str(store.path.resolve()))
-    return work(job, units_to_compute(job, chosen)[:most], notify)
+    return compute_units(job, units_to_compute(job, chosen)[:most], notify)
 
 
 # ---- executors -------------------------------------------------------------------------------------------------------
@@ -84,7 +84,7 @@ _WINDOW = 64  # units that an executor is given at a time: a scheduler holds thi
 _POLL = 0.2  # seconds between two looks at tasks that are no futures
 
 
-def submit(job: Job, units: list[int], executor: Any, notify: Notify) -> None:
+def submit_units(job: Job, units: list[int], executor: Any, notify: Notify) -> None:
     """Compute these units by an executor; raise what a task raises, `RuntimeError` if a worker has died."""
     path, remaining, running = str(job.store.path.resolve()), iter(units), set()
     try:
@@ -100,7 +100,7 @@ def submit(job: Job, units: list[int], executor: Any, notify: Notify) -> None:
             notify()
     except BrokenExecutor as death:  # of one of the first units that are not done: workers take them in order
         left = [unit for unit in units if not job.store.has_finished(unit)][: getattr(executor, "_max_workers", 1)]
-        ends = [job.grid.numbers(unit, np.array([0, job.grid.size(unit) - 1])) for unit in left]
+        ends = [job.grid.numbers(unit, np.array([0, job.grid.unit_size(unit) - 1])) for unit in left]
         which = ", or ".join(f"{unit} (members {a} to {b})" for unit, (a, b) in zip(left, ends, strict=True))
         raise RuntimeError(
             f"{path}: a worker process ended over unit {which}. What is done is kept. Look at these members with "
@@ -114,7 +114,7 @@ def submit(job: Job, units: list[int], executor: Any, notify: Notify) -> None:
 
 
 def run_unit(path: str, unit: int) -> None:
-    work(open_job(path), [unit])
+    compute_units(open_job(path), [unit])
 
 
 def _wait_for_first(running: set[Any]) -> set[Any]:

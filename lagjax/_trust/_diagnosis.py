@@ -1,4 +1,4 @@
-"""`diagnosis`: sentences on why a motion failed, from its first and its last state.
+"""`diagnose`: sentences on why a motion failed, from its first and its last state.
 
 `_stop_reason` gives a failure its code, from numbers alone and for every member of a batch. Here one motion is
 explained to the author of the scene: which force is not finite and from when on, the operation and the line of code
@@ -24,13 +24,13 @@ from lagjax._equations import (
     Motion,
     Sample,
     derivation_of,
-    describe_pieces,
+    describe_decisions,
     eigen,
+    find_offenders,
+    find_poles,
     forms,
     null_directions,
     numbers_of,
-    offenders,
-    poles,
     sparse_spectrum,
 )
 from lagjax._interface import RESULTS, Layout, code_of, halves, join_names, not_finite, numbers_at
@@ -71,7 +71,7 @@ _AT_CORNER = (
 
 
 class MotionEnd(NamedTuple):
-    """The first and the last state of one motion, in NumPy: `y` (2n,) at `t`, of times `t_first` … `t_last`."""
+    """The first and the last state (2n,) of one motion in NumPy, with their times, and its parameters."""
 
     code: int
     t: float
@@ -110,10 +110,10 @@ def describe_failure(trajectory: Trajectory, layout: Layout, why: str | None) ->
             spectrum = None if unused else sparse_spectrum(derivation, state)
             directions = [] if spectrum is None else [spectrum[0][1]]
         message += f"\n{_describe_null(unused, directions, layout.names)}"
-    return message + diagnosis(system, layout, params, ended)
+    return message + diagnose(system, layout, params, ended)
 
 
-def diagnosis(system: System, layout: Layout, params, ended: MotionEnd) -> str:
+def diagnose(system: System, layout: Layout, params, ended: MotionEnd) -> str:
     """Return what is known about a failure, as text that begins with a line break; "" if nothing is."""
     try:
         undefined, closed = _describe_gaps(system, layout, params, ended)
@@ -240,7 +240,7 @@ def _blame_operation(motion: Motion, role: str, arguments: tuple) -> str:
         function = on and (lambda q, qdot, t, params: on(q, t, params))
     if function is None or not _is_short(function, arguments):
         return ""
-    to_blame = offenders(function, *arguments, derivatives=role != "forces")
+    to_blame = find_offenders(function, *arguments, derivatives=role != "forces")
     if isinstance(function, CoupledForces) and to_blame and not to_blame[0].place:
         return _NO_MULTIPLIERS
     return f". It comes from {to_blame[0]}" if to_blame else ""
@@ -337,9 +337,9 @@ def _describe_runaway(derivation: Derivation, ended: MotionEnd) -> int | None:
 
 
 def _escape_place(system: System, derivation: Derivation, params, ended: MotionEnd, place: int) -> str:
-    """Return a sentence on where a coordinate diverges to: a pole of an operation in the force or L, or infinity."""
+    """Return a sentence on where coordinate number `place` diverges to: a pole of the force or L, or infinity."""
     functions, arguments = _short_functions(system, derivation.layout, params, ended)
-    pole = next((near for function in functions for near in poles(function, *arguments)), None)
+    pole = next((near for function in functions for near in find_poles(function, *arguments)), None)
     name, (q, v), (q_first, v_first) = derivation.layout.names[place], halves(ended.y), halves(ended.y_first)
     grown = f"its velocity was {v_first[place]:.3g} at the start and is {v[place]:.3g} where {name} = {q[place]:.3g}"
     if pole is not None:
@@ -392,7 +392,7 @@ def _run_check(system: System, derivation: Derivation, params, ended: MotionEnd)
         flat = FlatContacts.from_system(system, derivation.layout, params)
         of_contacts = (lambda q, qdot, t, p: flat.gaps(q, t, p)), flat.one_way, flat.slips
         functions += [f for f in of_contacts if _is_short(f, arguments)]
-    pieces = describe_pieces(functions, arguments) if jumps else ""
+    pieces = describe_decisions(functions, arguments) if jumps else ""
     return f"\nThe scene is pieced together by {pieces}.{_budget_end(ended)}" if pieces else ""
 
 

@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from scipy.stats import norm
 
 import lagjax
-from lagjax._fit.model._noise import find_sensor, rounding_square, worths
+from lagjax._fit.model._noise import find_sensor, rounding_square, sample_worths
 from lagjax._fit.model._sensor_faults import require_measurements
 
 TS = np.linspace(0.0, 12.0, 601)
@@ -181,9 +181,9 @@ def test_what_rounding_makes_of_least_squares_is_its_mean_over_offsets(speed):
 
 def test_worths():
     still, fast, noisy = np.zeros(500), 3.0 * np.arange(500), 2.0
-    assert worths(still, 1.0, 12**-0.5).sum() == pytest.approx(1.0, rel=0.2)
-    assert worths(fast, 1.0, 12**-0.5).sum() == 500
-    assert worths(still, 1.0, noisy).sum() == pytest.approx(500, rel=1e-6)
+    assert sample_worths(still, 1.0, 12**-0.5).sum() == pytest.approx(1.0, rel=0.2)
+    assert sample_worths(fast, 1.0, 12**-0.5).sum() == 500
+    assert sample_worths(still, 1.0, noisy).sum() == pytest.approx(500, rel=1e-6)
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.3, 0.6])

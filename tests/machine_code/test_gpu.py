@@ -29,7 +29,7 @@ from benchmarks._ptx import PtxOnCpu, outputs_of
 from lagjax import scenes
 from lagjax._engine.taylor import _gpu_launch, _primitives
 from lagjax._engine.taylor._call import call_host
-from lagjax._native.motions._gpu import MOTION, TRANSPOSE, GpuForm, OneLane, form_for, grid, libdevice
+from lagjax._native.motions._gpu import MOTION, TRANSPOSE, GpuForm, OneLane, form_for, grid_size, libdevice
 
 TS, MACHINE_CODE = np.linspace(0.0, 1.0, 5), lagjax.MachineCode()
 translated = functools.lru_cache(maxsize=64)(PtxOnCpu)
@@ -446,8 +446,8 @@ def test_the_lowering_launches_and_calls_nothing_else(dtype, count):
 
 
 def test_the_grid_covers_the_members_and_is_bounded():
-    assert grid(MOTION, 1) == (1, 64) and grid(MOTION, 65) == (2, 64)
-    assert grid(MOTION, 10**8) == (528, 64) and grid(TRANSPOSE, 10**8) == (264, 64)
+    assert grid_size(MOTION, 1) == (1, 64) and grid_size(MOTION, 65) == (2, 64)
+    assert grid_size(MOTION, 10**8) == (528, 64) and grid_size(TRANSPOSE, 10**8) == (264, 64)
 
 
 def test_words_are_the_bits_of_doubles():

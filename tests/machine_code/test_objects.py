@@ -172,7 +172,7 @@ def test_links_and_pipes_are_no_objects(cache, tmp_path):
 def test_the_home_of_a_user_is_found_in_a_path(monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("LAGJAX_CACHE", "~/kept")
-    assert _objects.folder() == tmp_path / "kept"
+    assert _objects.object_folder() == tmp_path / "kept"
 
 
 def test_what_was_not_used_for_longest_goes_first(cache, monkeypatch):
@@ -210,7 +210,7 @@ def test_the_folder_is_where_caches_belong(monkeypatch, tmp_path):
     monkeypatch.delenv("LAGJAX_CACHE", raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert _objects.folder() == tmp_path / "lagjax" / "objects"
+    assert _objects.object_folder() == tmp_path / "lagjax" / "objects"
     for word in ("off", "0"):
         monkeypatch.setenv("LAGJAX_CACHE", word)
-        assert _objects.folder() is None
+        assert _objects.object_folder() is None

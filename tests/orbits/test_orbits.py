@@ -99,7 +99,7 @@ def test_multipliers_of_many_arcs():
     bases = np.linalg.qr(rng.normal(size=(64, 4, 4)))[0]
     stretch = np.exp(np.array([1.0, 0.02, -0.02, -1.0]) * np.log(1e9) / 64)
     arcs = np.stack([bases[(k + 1) % 64] @ np.diag(stretch) @ bases[k].T for k in range(64)])
-    values = np.sort(np.abs(_floquet.multipliers_of(_floquet.Reduced(arcs, 0), True)))
+    values = np.sort(np.abs(_floquet.multipliers_of(_floquet.ReducedArcs(arcs, 0), True)))
     np.testing.assert_allclose(values, stretch[::-1] ** 64, rtol=1e-10)
     assert len(_floquet._merge_factors(arcs)) < 8
 

@@ -11,7 +11,7 @@ from jax import lax
 from scipy import special
 
 from lagjax import _native
-from lagjax._equations import borders
+from lagjax._equations import find_sides
 from lagjax._program import OPERATIONS, Operation, Unlowerable
 from lagjax._tracing import WRITTEN, lower
 
@@ -78,7 +78,7 @@ def test_a_new_operation_is_one_row(monkeypatch):
 def test_a_border_is_a_field_of_its_row(monkeypatch):
     function = lambda q, v, t, params: lax.erf_inv(q) * v
     state = jnp.float64(0.3), jnp.float64(1.0), 0.0, None
-    assert borders(function, *state) == []
+    assert find_sides([function], *state) == []
     with_side = Operation("erf_inv", 1, special.erfinv, newton, side=lambda f, c, w, u: f("ge", u, c(0.0)))
     monkeypatch.setitem(OPERATIONS, "erf_inv", with_side)
-    assert [(name, float(side)) for name, _, side in borders(function, *state)] == [("erf_inv", 1.0)]
+    assert [(name, float(side)) for name, _, side in find_sides([function], *state)] == [("erf_inv", 1.0)]

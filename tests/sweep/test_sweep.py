@@ -143,8 +143,8 @@ def test_crossings_do_not_depend_on_neighbours_and_workers(tmp_path, how, monkey
     ts, rule = np.array([0.0, 2.0]), {**RULE, **WITH_CROSSINGS}
     whole = run_sweep(PENDULUM, OVER, ts, **{**rule, "store": tmp_path / "whole"}).open().load()
     store = tmp_path / "store"
-    stopped = lambda job, left, tell: _workers.work(job, left[:2], tell)
-    monkeypatch.setattr("lagjax._sweep.work", stopped)
+    stopped = lambda job, left, tell: _workers.compute_units(job, left[:2], tell)
+    monkeypatch.setattr("lagjax._sweep.compute_units", stopped)
     run_sweep(PENDULUM, OVER, ts, **{**rule, "store": store, **how})
     monkeypatch.undo()
     data = run_sweep(PENDULUM, OVER, ts, **{**rule, "store": store, **how}).open()
@@ -199,12 +199,12 @@ def test_statistics_are_those_of_the_members(tmp_path):
 def test_statistics_leave_out_what_is_not_finite():
     values, ok = np.array([[1.0], [np.nan], [5.0], [-2.0]]), np.array([True, True, False, True])
     how = lagjax.Statistics(quantiles=(0.5,))
-    part = _statistics.partial_of(how, values, ok, np.arange(10, 14))
-    nothing = _statistics.partial_of(how, values[1:3], ok[1:3], np.arange(2))
-    for total in (part, _statistics.merge(part, nothing), _statistics.merge(nothing, part)):
-        got = _statistics.summary(how, total, ())
+    part = _statistics.unit_statistics(how, values, ok, np.arange(10, 14))
+    nothing = _statistics.unit_statistics(how, values[1:3], ok[1:3], np.arange(2))
+    for total in (part, _statistics.merge_statistics(part, nothing), _statistics.merge_statistics(nothing, part)):
+        got = _statistics.summarize(how, total, ())
         assert got.count == 2 and got.mean == -0.5 and got.variance == 4.5 and got.min_member == 13
-    assert np.isnan(_statistics.summary(how, nothing, ()).mean)
+    assert np.isnan(_statistics.summarize(how, nothing, ()).mean)
 
 
 # ---- members and units -----------------------------------------------------------------------------------------------
@@ -214,7 +214,7 @@ def test_statistics_leave_out_what_is_not_finite():
 @pytest.mark.parametrize("size", [1, 4, 60, 10**6])
 def test_units_tile_the_members_in_order(shape, size):
     grid = Grid.from_shape(shape, size)
-    numbers = [grid.numbers(unit, np.arange(grid.size(unit))) for unit in range(grid.units)]
+    numbers = [grid.numbers(unit, np.arange(grid.unit_size(unit))) for unit in range(grid.unit_count)]
     np.testing.assert_array_equal(np.concatenate(numbers), np.arange(np.prod(shape)))
     assert max(map(len, numbers)) <= size
 
@@ -223,7 +223,7 @@ def test_a_hundred_million_members_are_no_list(monkeypatch):
     monkeypatch.setattr(designs, "SLICE", 1000)
     over = {"a": np.linspace(0, 1, 10_000), "b": designs.random(10_000)}
     grid = Grid.from_shape(tuple(axis.size for axis in axes_of(over)), 10**6)
-    assert grid.members == 10**8 and grid.units == 100 and grid.box(99)[0] == slice(9900, 10_000)
+    assert grid.member_count == 10**8 and grid.unit_count == 100 and grid.box(99)[0] == slice(9900, 10_000)
     (axis,) = axes_of({("x", "y"): designs.random(10**8, seed=3)})
     start, first = next(axis.pieces())
     assert start == 0 and len(first) == 1000
@@ -255,8 +255,8 @@ def test_latin_hypercube_has_one_point_in_each_part():
 def begun(folder, units=0, **changes):
     """A store of which so many units are done."""
     with pytest.MonkeyPatch.context() as patch:
-        run = _workers.work
-        patch.setattr("lagjax._sweep.work", lambda job, left, tell: run(job, left[:units], tell))
+        run = _workers.compute_units
+        patch.setattr("lagjax._sweep.compute_units", lambda job, left, tell: run(job, left[:units], tell))
         swept(folder, **changes)
     return Files(folder / "store")
 
@@ -524,8 +524,8 @@ def test_units_whose_chunks_are_gone_are_not_done(tmp_path, capsys):
 
 def test_stores_of_another_version_are_left_alone(tmp_path, undisturbed, monkeypatch):
     swept(tmp_path)
-    here = _job.versions()
-    monkeypatch.setattr(_job, "versions", lambda: here | {"jax": "0.1"})
+    here = _job.package_versions()
+    monkeypatch.setattr(_job, "package_versions", lambda: here | {"jax": "0.1"})
     with pytest.raises(ValueError, match=r"begun with jax .*, here 0.1: its numbers would not be of one program"):
         swept(tmp_path)
     monkeypatch.setattr(_files, "FORMAT", 7)
@@ -536,8 +536,8 @@ def test_stores_of_another_version_are_left_alone(tmp_path, undisturbed, monkeyp
 
 def test_another_kind_of_cpu_goes_on_and_is_told(tmp_path, undisturbed, monkeypatch):
     begun(tmp_path, 2)
-    here = _job.cpu()
-    monkeypatch.setattr(_job, "cpu", lambda: "an abacus")
+    here = _job.cpu_kind()
+    monkeypatch.setattr(_job, "cpu_kind", lambda: "an abacus")
     with pytest.warns(UserWarning, match=r"begun on a CPU of the kind .*, and continues here on an abacus"):
         told = swept(tmp_path).status()
     assert told.cpus == (here, "an abacus") and "an abacus: their members" in str(told)
@@ -673,7 +673,7 @@ def test_a_later_end_of_members_that_have_ended_and_by_other_workers(tmp_path, m
     for name in ("end.t", "end.q", "end.qdot"):
         np.testing.assert_allclose(np.where(fell, one[name], two[name]), both[name], atol=1e-7)
     rule = {**RULE, "keep": keep_end, "extend": first.store, "event": at_the_bottom}
-    monkeypatch.setattr("lagjax._sweep.work", lambda *_: None)
+    monkeypatch.setattr("lagjax._sweep.compute_units", lambda *_: None)
     begun = run_sweep(PENDULUM, OVER, TO_TWO, **{**rule, "store": tmp_path / "shell"})
     assert worker(Files(begun.store)).wait() == 0
     assert digests(tmp_path, "rest") == digests(tmp_path, "shell")

@@ -203,7 +203,7 @@ def drawn(count, seed=3, kind=lagjax.designs.random):
 
 @pytest.mark.slow
 def test_to_extend_a_design_reads_none_of_its_values(tmp_path, monkeypatch):
-    monkeypatch.setattr("lagjax._sweep.work", lambda *_: None)
+    monkeypatch.setattr("lagjax._sweep.compute_units", lambda *_: None)
     few = swept(tmp_path / "few", drawn(10**6), unit=10**5)
     monkeypatch.setattr(Files, "coordinates", lambda *_: pytest.fail("read values"))
     swept(tmp_path / "many", drawn(2 * 10**6), unit=10**5, extend=few.store)

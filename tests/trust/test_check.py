@@ -9,7 +9,7 @@ import pytest
 from sweeps import KINDS, sweep
 
 import lagjax
-from lagjax._trust.checks._differences import Slopes, differ, ladder, slopes
+from lagjax._trust.checks._differences import Slopes, slopes, slopes_differ, step_ladder
 
 
 class Polar(NamedTuple):
@@ -69,15 +69,15 @@ def test_differences_know_their_error(dtype):
     # Slopes of functions on very different scales, at a point of size 1; errors as good as the dtype can give them.
     functions = [np.sin, lambda x: np.cos(100 * x) / 100, lambda x: 1e8 + np.exp(x), lambda x: 1 / (x - 0.89), np.sqrt]
     exact = [np.cos(1.0), -np.sin(100.0), np.e, -1 / 0.11**2, 0.5]
-    steps = ladder(np.ones(1), dtype)
+    steps = step_ladder(np.ones(1), dtype)
     x, eps = dtype(0.9) + dtype(0.1), float(np.finfo(dtype).eps)
     for function, slope in zip(functions, exact, strict=True):
         back, here, ahead = (np.asarray(function(x + s * steps[:, 0]), dtype) for s in (-1, 0, 1))
         found = slopes(back[None, :, None], here[:1], ahead[None, :, None], steps, np.ones(1), eps)
         for one in found:
             assert abs(one.value[0, 0] - slope) <= 8 * one.error[0, 0] + 2 * eps * abs(slope) / eps ** (1 / 3)
-        assert not differ(found[1], found[2], dtype).any()
-        assert differ(found[0], Slopes(np.array([[-slope]]), np.zeros((1, 1))), dtype).all() == (
+        assert not slopes_differ(found[1], found[2], dtype).any()
+        assert slopes_differ(found[0], Slopes(np.array([[-slope]]), np.zeros((1, 1))), dtype).all() == (
             found[0].error[0, 0] < 0.1 * abs(slope)
         )
 

@@ -22,7 +22,7 @@ from lagjax._engine.taylor import MachineCode, Motions, flow_of, jvp, tolerances
 from lagjax._equations import Sample, Scales, has_constraints
 from lagjax._interface import SUCCESSFUL, Layout, as_arrays, halves, require_concrete, require_finite, require_number
 from lagjax._primitives import sentence
-from lagjax._run.hybrid import Scene, first_law, jumps, laws, require_scene
+from lagjax._run.hybrid import Scene, first_law, list_laws, may_jump, require_scene
 from lagjax._scene import drop_contacts, require_system
 
 
@@ -61,7 +61,7 @@ class Units(NamedTuple):
     def repeat(self, count: int) -> "Units":
         return Units(*(np.repeat(x, count, axis=0) for x in self))
 
-    def growth(self, growth: np.ndarray) -> np.ndarray:
+    def scale_growth(self, growth: np.ndarray) -> np.ndarray:
         """Convert derivatives of states by states, (R, …, 2n, 2n), to these units."""
         state = self.state.reshape(len(self.state), *[1] * (growth.ndim - 3), -1)
         return growth * state[..., None, :] / state[..., :, None]
@@ -84,14 +84,14 @@ class Arcs:
 
     @classmethod
     def from_system(
-        cls, scene: Scene, layout: Layout, params: PyTree, rtol: float, what: str, may_jump: bool = False
+        cls, scene: Scene, layout: Layout, params: PyTree, rtol: float, what: str, jumps: bool = False
     ) -> "Arcs":
-        """Return the arcs of a scene; `what` is for messages; contacts and modes are refused unless `may_jump`."""
-        scene = require_scene(scene) if may_jump else require_system(scene)
-        jumping = JumpingMotions(scene, layout, params, rtol) if jumps(scene) else None
-        require_untraced((laws(scene), params), "A parameter")
+        """Return the arcs of a scene; `what` is for messages; contacts and modes are refused unless it `jumps`."""
+        scene = require_scene(scene) if jumps else require_system(scene)
+        jumping = JumpingMotions(scene, layout, params, rtol) if may_jump(scene) else None
+        require_untraced((list_laws(scene), params), "A parameter")
         system = drop_contacts(first_law(scene))  # whose free motion is for units and charts
-        if any(map(has_constraints, laws(scene))):
+        if any(map(has_constraints, list_laws(scene))):
             raise ValueError(
                 f"{what} cannot be found with constraints yet: give the scene coordinates that need none, angles of "
                 "links instead of positions of their ends."
@@ -112,21 +112,21 @@ class Arcs:
         other.numbers = numbers
         return other
 
-    def ends(self, times: np.ndarray, y0: np.ndarray):
+    def integrate(self, times: np.ndarray, y0: np.ndarray):
         """Integrate without derivatives, `times` (R, T) or (1, T) and `y0` (R, 2n): a `Solution` or `JumpRun`."""
         if self.jumping is not None:
             return self.jumping.run(times, y0)
         return self.flow.run(times, y0, self.numbers[None], self.tolerances)
 
-    def equal_shares(self, span: np.ndarray, y0: np.ndarray, count: int) -> np.ndarray:
-        """Divide spans (R,) into `count` parts with about equally many steps each: fractions (R, count + 1).
+    def divide_evenly(self, span: np.ndarray, y0: np.ndarray, count: int) -> np.ndarray:
+        """Fractions (R, count + 1) that divide each span (R,) into parts with about equally many steps.
 
         A part begins where the state is small and changes slowly, if there is such a time nearby.
         """
         shares = np.tile(np.arange(count + 1) / count, (len(y0), 1))
         times = np.stack([np.zeros_like(span), span], axis=1)
         room = min(_BUDGET * len(y0), _MOST_WRITTEN // (y0.shape[1] + 4))
-        run, found = self.flow.follow(times, y0, self.numbers[None], self.tolerances, room)
+        run, found = self.flow.run_and_record(times, y0, self.numbers[None], self.tolerances, room)
         for row, table in (member for steps in found for member in steps.split_members()):
             if run.result[row] == SUCCESSFUL and len(table) >= 4 * count:
                 begins, lengths = table[:, :2].T / span[row]
@@ -135,7 +135,7 @@ class Arcs:
                 shares[row, 1:-1] = [begins[some[np.argmax(lengths[some])]] for some in around]
         return shares
 
-    def follow(self, times: np.ndarray, y0: np.ndarray, directions: np.ndarray | None = None, modes=None) -> Arc:
+    def differentiate(self, times: np.ndarray, y0: np.ndarray, directions: np.ndarray | None = None, modes=None) -> Arc:
         """Integrate from `y0` (R, 2n), in `modes` (R,), over `times` (R, 2), with derivatives: an `Arc`."""
         rows, states = y0.shape
         if self.jumping is not None:
@@ -152,7 +152,7 @@ class Arcs:
         well = run.result == SUCCESSFUL
         moved = np.full(dy0.shape, np.nan)
         if well.any():
-            motions = Motions.from_solution(times, y0, params, run).take(np.flatnonzero(well))
+            motions = Motions.from_solution(times, y0, params, run).select_members(np.flatnonzero(well))
             moved[well] = jvp(self.flow, motions, dy0[well], dparams[well], self.tolerances)[1]
         end = np.where(well[:, None], run.y_end, np.nan)
         by_start, by_params = np.split(np.swapaxes(moved, 1, 2), [states], axis=2)
@@ -199,12 +199,12 @@ class Arcs:
         of = self.sample(t, y).quantities("lagrangian", "momentum")
         return np.sum(of["momentum"] * halves(y)[1], axis=1) - of["lagrangian"].reshape(len(y))
 
-    def energy_slope(self, t, y: np.ndarray) -> np.ndarray:
-        """Return ∂h/∂y, (R, 2n)."""
-        of = self.sample(t, y).quantities("energy_by_q", "mass_matrix")
+    def energy_slope(self, y: np.ndarray) -> np.ndarray:
+        """Return ∂h/∂y (R, 2n) of a scene that does not read the time."""
+        of = self.sample(0.0, y).quantities("energy_by_q", "mass_matrix")
         return np.concatenate([of["energy_by_q"], np.einsum("rij,rj->ri", of["mass_matrix"], halves(y)[1])], axis=1)
 
-    def canonical(self, t, y: np.ndarray, units: Units) -> np.ndarray:
+    def canonical_charts(self, t, y: np.ndarray, units: Units) -> np.ndarray:
         """Return ∂(q, p)/∂(q, q̇), (R, 2n, 2n), with q and q̇ in `units`, in which the symplectic form is standard.
 
         The unit of pᵢ is such that its product with that of qᵢ is the same for all i.
@@ -217,7 +217,7 @@ class Arcs:
         of_p = (units.length**2 / units.time)[:, None] / of_q
         return chart * units.state[:, None, :] / np.concatenate([of_q, of_p], axis=1)[:, :, None]
 
-    def why_not(self, row: int, arc: Arc, y0: np.ndarray, t_last: float) -> str:
+    def explain_failure(self, row: int, arc: Arc, y0: np.ndarray, t_last: float) -> str:
         if not np.broadcast_to(arc.returns, arc.result.shape)[row]:
             return "It ends in another mode: give a period in which it comes back to the one it began in."
         if arc.result[row] == SUCCESSFUL:
@@ -232,7 +232,7 @@ _MOST_WRITTEN = 2**26  # numbers of steps of all motions whose shares are sought
 # ---- starts as the user gives them, as rows --------------------------------------------------------------------------
 
 
-def starts(q0: PyTree, qdot0: PyTree, time, name: str) -> tuple[np.ndarray, Layout, np.ndarray]:
+def check_starts(q0: PyTree, qdot0: PyTree, time, name: str) -> tuple[np.ndarray, Layout, np.ndarray]:
     """Check starts and `time`, called `name`, one for all or one per member: times () or (N,), layout, states (N, 2n).
 
     Raises `TypeError` or `ValueError` if they do not fit together, are traced, or not finite.

@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 
-class Round(NamedTuple):
-    """The eliminated unknowns in terms of the others: `of_left`, `of_right` (B, K/2, s, s), `of_z` (B, K/2, s, c)."""
+class EliminationRound(NamedTuple):
+    """Eliminated unknowns by the others: `of_left`, `of_right` (B, K/2, s, s), `of_z` (B, K/2, s, c)."""
 
     of_left: np.ndarray
     of_right: np.ndarray
@@ -30,9 +30,9 @@ class Condensed(NamedTuple):
     first: np.ndarray
     last: np.ndarray
     more: np.ndarray
-    rounds: tuple[Round, ...]
+    rounds: tuple[EliminationRound, ...]
 
-    def inner(self, x: np.ndarray, end: np.ndarray, z: np.ndarray) -> np.ndarray:
+    def expand_solution(self, x: np.ndarray, end: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Return all unknowns (B, K, s, m) from those at the ends, x_0 and x_K (B, s, m), and z (B, c, m)."""
         known = np.stack([x, end], axis=1)
         for of in reversed(self.rounds):
@@ -44,7 +44,7 @@ class Condensed(NamedTuple):
         return known[:, :-1]
 
 
-def condense(growth: np.ndarray, more: np.ndarray) -> Condensed:
+def condense_chain(growth: np.ndarray, more: np.ndarray) -> Condensed:
     """Condense a chain with A_k = `growth` (B, K, s, s), B_k = −1, C_k = `more` (B, K, s, c), K a power of two."""
     s, left, right, rounds = growth.shape[2], growth, np.broadcast_to(-np.eye(growth.shape[2]), growth.shape), []
     while left.shape[1] > 1:
@@ -54,6 +54,6 @@ def condense(growth: np.ndarray, more: np.ndarray) -> Condensed:
         of_z = qt @ np.concatenate([more[:, ::2], more[:, 1::2]], axis=2)
         parts = np.concatenate([of_left[:, :, :s], of_right[:, :, :s], of_z[:, :, :s]], axis=3)
         solved = -np.linalg.solve(r[:, :, :s], parts)
-        rounds.append(Round(solved[..., :s], solved[..., s : 2 * s], solved[..., 2 * s :]))
+        rounds.append(EliminationRound(solved[..., :s], solved[..., s : 2 * s], solved[..., 2 * s :]))
         left, right, more = of_left[:, :, s:], of_right[:, :, s:], of_z[:, :, s:]
     return Condensed(left[:, 0], right[:, 0], more[:, 0], tuple(rounds))

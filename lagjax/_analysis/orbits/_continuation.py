@@ -23,10 +23,10 @@ import numpy as np
 
 from lagjax._analysis.orbits import _shooting
 from lagjax._analysis.orbits._arc_motions import Arcs
-from lagjax._analysis.orbits._condensation import Condensed, condense
+from lagjax._analysis.orbits._condensation import Condensed, condense_chain
 from lagjax._analysis.orbits._orbit import CLOSED, MOST_ARCS
 from lagjax._analysis.orbits._shooting import Chain, Closing
-from lagjax._equations import decide, span_outside
+from lagjax._equations import span_outside, truncated_svd
 
 _TRIALS = 8  # of Newton's method: beyond, the step along the family was too long
 # A step is repeated at half its length beyond these: the ratio of the second correction to the first, the first one in
@@ -97,20 +97,20 @@ class Follower:
         self.of_value = 1.0
         self.period_is_free = not arcs.driven and (place is None or not arcs.conserves)
 
-    def closing(self, numbers: np.ndarray) -> Closing:
-        return Closing.plain(self.arcs.with_numbers(numbers))
+    def closing_conditions(self, numbers: np.ndarray) -> Closing:
+        return Closing.from_arcs(self.arcs.with_numbers(numbers))
 
-    def point(self, y, period, parts, numbers) -> FamilyPoint:
-        """Return the chain through these states, (1, K, 2n), and its closing equations."""
-        closing = self.closing(numbers)
-        chain = _shooting.follow(closing, y, period, parts, self.units)
+    def orbit_point(self, y, period, parts, numbers) -> FamilyPoint:
+        """Return the orbit through states y (1, K, 2n), with its closing equations."""
+        closing = self.closing_conditions(numbers)
+        chain = _shooting.integrate_chain(closing, y, period, parts, self.units)
         columns = [chain.rate[..., None] * np.diff(chain.parts)[..., None, None]] if self.period_is_free else []
         if self.place is not None:
             columns.append(self._parameter_derivatives(closing, y, period, parts, self.place))
         if not chain.ok[0]:
             nothing = np.zeros((0, 0))
             return FamilyPoint(chain, numbers, nothing, Condensed(nothing, nothing, nothing, ()), nothing)
-        condensed = condense(chain.growth, np.concatenate([*columns, chain.defect[..., None]], axis=3))
+        condensed = condense_chain(chain.growth, np.concatenate([*columns, chain.defect[..., None]], axis=3))
         matrix = np.concatenate([condensed.first + condensed.last, condensed.more[..., :-1]], axis=2)[0]
         return FamilyPoint(chain, numbers, matrix, condensed, condensed.more[0, :, -1])
 
@@ -122,26 +122,26 @@ class Follower:
         times = np.stack([spans[:-1], spans[1:]], axis=1)
         if not self.arcs.driven:
             times[:, 1] = whole * np.diff(parts[0])
-        by_params = closing.arcs.follow(times, y[0] * state, direction).by_params
+        by_params = closing.arcs.differentiate(times, y[0] * state, direction).by_params
         return by_params[None] * self.of_parameter / state[:, None]
 
     def complete_change(self, point: FamilyPoint, first: np.ndarray, right: float) -> "FamilyUnknowns":
         """Return the change of all numbers that follows linearly from a change `first` (2n + F,) of the unknowns."""
         states = point.chain.y.shape[2]
         z = np.append(first[states:], right)[None, :, None]
-        dy = point.condensed.inner(first[None, :states, None], first[None, :states, None], z)[..., 0]
+        dy = point.condensed.expand_solution(first[None, :states, None], first[None, :states, None], z)[..., 0]
         by = np.zeros(len(point.numbers))
         if self.place is not None:
             by[self.place] = self.of_parameter * first[-1]
         return FamilyUnknowns(dy, first[states : states + 1] if self.period_is_free else np.zeros(1), by)
 
-    def move(self, point: FamilyPoint, first: np.ndarray, right: float) -> FamilyPoint:
+    def apply_change(self, point: FamilyPoint, first: np.ndarray, right: float) -> FamilyPoint:
         """Return the point after a change (2n + F,) of its unknowns; states of inner arcs change with them."""
-        return self.rebuild(point, jax.tree.map(np.add, point.unknowns, self.complete_change(point, first, right)))
+        return self.build_point(point, jax.tree.map(np.add, point.unknowns, self.complete_change(point, first, right)))
 
-    def rebuild(self, point: FamilyPoint, whole: "FamilyUnknowns") -> FamilyPoint:
+    def build_point(self, point: FamilyPoint, whole: "FamilyUnknowns") -> FamilyPoint:
         """Return the point with the numbers `whole`, its arcs at the same fractions of the period as `point`."""
-        return self.point(whole.y, whole.period, point.chain.parts, whole.numbers)
+        return self.orbit_point(whole.y, whole.period, point.chain.parts, whole.numbers)
 
     def refine_arcs(self, point: FamilyPoint) -> FamilyPoint:
         """Divide the orbit into more arcs if errors grow much along one arc; else return the point itself."""
@@ -154,16 +154,16 @@ class Follower:
 
     def divide_orbit(self, y0: np.ndarray, period: np.ndarray, count: int, numbers: np.ndarray) -> FamilyPoint:
         """Divide the orbit from a state (1, 2n) with a period (1,), both in the user's units, into `count` arcs."""
-        parts, y = _shooting.guesses(self.closing(numbers), y0, period, count)
-        return self.point(y / self.units.state[:, None], period / self.units.time, parts, numbers)
+        parts, y = _shooting.guess_states(self.closing_conditions(numbers), y0, period, count)
+        return self.orbit_point(y / self.units.state[:, None], period / self.units.time, parts, numbers)
 
-    def slope(self, point: FamilyPoint) -> np.ndarray:
+    def ascent(self, point: FamilyPoint) -> np.ndarray:
         """Return the unit vector (2n + F,) along which the value increases."""
         slope = np.zeros(point.matrix.shape[1])
         if self.place is not None:
             slope[-1] = 1.0
         else:
-            by_state = self.arcs.energy_slope(0.0, point.chain.states())[0] * self.units.state[0]
+            by_state = self.arcs.energy_slope(point.chain.states())[0] * self.units.state[0]
             slope[: len(by_state)] = by_state / (np.linalg.norm(by_state) or 1.0)
         return slope
 
@@ -185,8 +185,8 @@ def tangent_at(
     the tangent is then the direction nearest to `before`.
     """
     states = point.matrix.shape[0]
-    whole, still = decide(point.matrix, _shooting.RANK), decide(point.matrix[:, :states], _shooting.RANK)
-    slope, count, rank = follower.slope(point), states - int(still.rank), int(whole.rank)
+    whole, still = truncated_svd(point.matrix, _shooting.RANK), truncated_svd(point.matrix[:, :states], _shooting.RANK)
+    slope, count, rank = follower.ascent(point), states - int(still.rank), int(whole.rank)
     if before is not None:  # a rank that falls short of itself in passing a branch point
         at_least = whole.values[before.rank - 1] > _ROUNDING * whole.values[0]
         rank = max(rank, before.rank) if at_least else rank
@@ -195,7 +195,7 @@ def tangent_at(
     symmetries[:states] = still.right[:, states - count :]
     if before is None:  # that in which the value rises is no symmetry
         along = symmetries.T @ slope
-        symmetries = symmetries @ decide(along[None], absolute=1e-6 * float(np.linalg.norm(slope))).null
+        symmetries = symmetries @ truncated_svd(along[None], absolute=1e-6 * float(np.linalg.norm(slope))).null
     across = span_outside(whole.right[:, rank - left_out :], symmetries)
     vector = across @ (across.T @ (slope if before is None else before.vector))
     length = np.linalg.norm(vector)
@@ -212,7 +212,7 @@ class FamilyStep(NamedTuple):
     share: float
 
 
-def correct(
+def correct_orbit(
     follower: Follower, point: FamilyPoint, across: FamilyTangent, left_out: int = 0
 ) -> tuple[FamilyPoint, np.ndarray] | None:
     """Return the orbit in the plane across a tangent, and the sizes of Newton's corrections; None if none is found.
@@ -228,15 +228,15 @@ def correct(
             return point, np.array(sizes)
         before = closure
         matrix, right = np.concatenate([point.matrix, across.vector[None]]), np.append(point.right, 0.0)
-        change = -decide(matrix)._replace(rank=np.array(across.rank + 1 - left_out)).least_norm(right)
+        change = -truncated_svd(matrix)._replace(rank=np.array(across.rank + 1 - left_out)).least_norm(right)
         sizes.append(np.linalg.norm(change))
-        point = follower.move(point, change, 1.0)
+        point = follower.apply_change(point, change, 1.0)
     return (point, np.array(sizes)) if point.closed(CLOSED) else None
 
 
 def step_along(follower: Follower, last: FamilyPoint, tangent: FamilyTangent, step: float) -> FamilyStep | None:
     """Return the orbit one step further; None if the step was too long for the family."""
-    there = correct(follower, follower.move(last, step * tangent.vector, 0.0), tangent)
+    there = correct_orbit(follower, follower.apply_change(last, step * tangent.vector, 0.0), tangent)
     if there is None:
         return None
     point, sizes = there

@@ -22,19 +22,19 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax._analysis.orbits import _shooting
-from lagjax._analysis.orbits._arc_motions import Arcs, starts
+from lagjax._analysis.orbits._arc_motions import Arcs, check_starts
 from lagjax._analysis.orbits._continuation import (
     FamilyPoint,
     FamilyTangent,
     Follower,
-    correct,
+    correct_orbit,
     next_step,
     step_along,
     tangent_at,
 )
-from lagjax._analysis.orbits._floquet import passage_determinant, reduce
+from lagjax._analysis.orbits._floquet import passage_determinant, reduce_arcs
 from lagjax._analysis.orbits._orbit import RTOL, FlatOrbits, Orbit, arc_counts, assess_orbits, restore_orbits
-from lagjax._equations import decide, span_outside
+from lagjax._equations import span_outside, truncated_svd
 from lagjax._interface import Layout, halves, labelled_leaves, require_budget, require_tolerance
 from lagjax._primitives import accepts_singles
 from lagjax._scene import System
@@ -118,7 +118,7 @@ def family(
     require_tolerance(step, "step")
     if jnp.ndim(orbit.period) or not bool(orbit.ok):
         raise ValueError("orbit must be one periodic orbit that is ok: of a batch take one member, and see why not.")
-    period, layout, y0 = starts(orbit.q0, orbit.qdot0, orbit.period, "period")
+    period, layout, y0 = check_starts(orbit.q0, orbit.qdot0, orbit.period, "period")
     arcs = Arcs.from_system(system, layout, params, RTOL, "Families")
     place = None if by == "energy" else _parameter_index(params, by)
     follower = Follower(arcs, place, y0, period.ravel(), until)
@@ -155,16 +155,17 @@ class _Member(NamedTuple):
 
 def _build_member(follower: Follower, point: FamilyPoint, tangent: FamilyTangent, most: int | None) -> _Member:
     """Return an orbit with its multipliers; at most `most` directions count as symmetries."""
-    (symmetries,) = _shooting.symmetries(point.chain, most)
+    (symmetries,) = _shooting.find_null_spaces(point.chain, most)
     count = symmetries.null.shape[2]
-    found = assess_orbits(follower.closing(point.numbers), point.chain, count)
-    reduced = reduce(point.chain.growth[0], *symmetries)
+    found = assess_orbits(follower.closing_conditions(point.numbers), point.chain, count)
+    reduced = reduce_arcs(point.chain.growth[0], *symmetries)
     through = [passage_determinant(reduced, sign) if not found.message[0] else np.nan for sign in (1, -1)]
     beyond = np.nan if follower.until is None else (follower.value(point) - follower.until) / follower.of_value
-    return _Member(point, tangent, count, found, np.array([follower.slope(point) @ tangent.vector, *through, beyond]))
+    return _Member(point, tangent, count, found, np.array([follower.ascent(point) @ tangent.vector, *through, beyond]))
 
 
 def _follow_family(follower: Follower, y0, period, step: float, count: int) -> tuple[list[_Member], str]:
+    """Return the orbits of a family, at most `count`, from one of them, and the sentence on its end."""
     point, shortest, until = _first_point(follower, y0, period, follower.arcs.numbers), _SHORTEST * step, follower.until
     if until is not None:
         follower.of_value = abs(until - follower.value(point)) or 1.0
@@ -203,7 +204,7 @@ def _refine_member(follower: Follower, member: _Member) -> _Member:
     """Divide the member's orbit into more arcs if errors grow much along one; else return the member itself."""
     if (point := follower.refine_arcs(member.point)) is member.point:
         return member
-    there = correct(follower, point, member.tangent)
+    there = correct_orbit(follower, point, member.tangent)
     return member if there is None else member._replace(point=there[0])
 
 
@@ -284,7 +285,7 @@ def _orbit_between(
     along = ((found[x].point, found[x].tangent.vector) for x in (a, b))
     slopes = (follower.complete_change(point, vector / (vector @ across.vector), 0.0) for point, vector in along)
     guess = jax.tree.map(lambda *parts: sum(map(operator.mul, shares, parts)), *ends, *slopes)
-    there = correct(follower, follower.rebuild(found[a].point, guess), across, left_out)
+    there = correct_orbit(follower, follower.build_point(found[a].point, guess), across, left_out)
     tangent = None if there is None else tangent_at(follower, there[0], found[a].tangent, left_out)
     if there is None or tangent is None or tangent.vector @ across.vector < _ALONG:
         return None
@@ -359,14 +360,14 @@ def branch_off(
             f"No orbit of another family was found {size:.3g} from orbit {index}: try another size, or follow the "
             "family again with another first step, so that its neighbours lie elsewhere."
         )
-    found = assess_orbits(follower.closing(point.numbers), point.chain, before.symmetries.shape[1])
+    found = assess_orbits(follower.closing_conditions(point.numbers), point.chain, before.symmetries.shape[1])
     return restore_orbits(follower.arcs.layout, FlatOrbits(*(x[0] for x in found)), found.message[0])
 
 
 def _orbit_start(family: Family, k: int, turns: int) -> tuple[np.ndarray, np.ndarray, Layout]:
     """Return the first state (1, 2n) of orbit k and its period (1,) times `turns`, and the layout."""
     q0, qdot0 = jax.tree.map(lambda x: x[k], (family.q0, family.qdot0))
-    period, layout, y0 = starts(q0, qdot0, turns * family.period[k], "period")
+    period, layout, y0 = check_starts(q0, qdot0, turns * family.period[k], "period")
     return y0, period.ravel(), layout
 
 
@@ -376,8 +377,8 @@ def _branching_orbit(follower: Follower, here: FamilyPoint, before: FamilyTangen
     Symmetries are known from a neighbour: at the branch point singular values do not distinguish them.
     """
     states, count = here.matrix.shape[0], before.symmetries.shape[1]
-    still = decide(here.matrix[:, :states]).right[:, states - count - 1 :]
-    null = decide(here.matrix).right[:, before.rank - 1 :]
+    still = truncated_svd(here.matrix[:, :states]).right[:, states - count - 1 :]
+    null = truncated_svd(here.matrix).right[:, before.rank - 1 :]
     known = np.zeros((null.shape[0], count + 1))
     known[:states, :count] = still @ (still.T @ before.symmetries[:states])
     known[:, count] = null @ (null.T @ before.vector)
@@ -385,5 +386,5 @@ def _branching_orbit(follower: Follower, here: FamilyPoint, before: FamilyTangen
     if not directions.shape[1]:
         return None
     across = FamilyTangent(directions[:, 0], before.rank, before.symmetries)
-    there = correct(follower, follower.move(here, size * across.vector, 0.0), across)
+    there = correct_orbit(follower, follower.apply_change(here, size * across.vector, 0.0), across)
     return None if there is None else there[0]

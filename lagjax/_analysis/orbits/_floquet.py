@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._equations import decide
+from lagjax._equations import truncated_svd
 
 # |multiplier| − 1 above this makes an orbit unstable. Multipliers on the unit circle come out within 1e-9 of it, where
 # two of them meet within the square root of their accuracy, 1e-6.
@@ -23,41 +23,41 @@ UNSTABLE = 1e-5
 UNCERTAIN = 1e-3
 
 
-class Reduced(NamedTuple):
+class ReducedArcs(NamedTuple):
     """The arcs restricted to unknown multipliers, `growth` (K, m, m), and the number of those known to be 1."""
 
     growth: np.ndarray
     known: int
 
 
-def reduce(growth: np.ndarray, null: np.ndarray, of_transpose: np.ndarray) -> Reduced:
+def reduce_arcs(growth: np.ndarray, null: np.ndarray, of_transpose: np.ndarray) -> ReducedArcs:
     """Restrict arcs `growth` (K, 2n, 2n) of a closed chain to ker ℓ / W, W = `null` and ℓ = `of_transpose`.
 
     Both are (K, 2n, k); where W is empty, the arcs stay as they are.
     """
     count, states, _ = growth.shape
     if not null.shape[2]:
-        return Reduced(growth, 0)
+        return ReducedArcs(growth, 0)
     bases = [_quotient_basis(w, ell) for w, ell in zip(null, of_transpose, strict=True)]
     width, *others = {basis.shape[1] for basis in bases}
     if others:
-        return Reduced(growth, 0)
+        return ReducedArcs(growth, 0)
     moved = [bases[(k + 1) % count].T @ growth[k] @ bases[k] for k in range(count)]
-    return Reduced(np.stack(moved), states - width)
+    return ReducedArcs(np.stack(moved), states - width)
 
 
 def _quotient_basis(null: np.ndarray, of_transpose: np.ndarray) -> np.ndarray:
     """Return an orthonormal basis (2n, m) of the part of ker ℓ that is orthogonal to W ∩ ker ℓ."""
     w, ell = np.linalg.qr(null)[0], np.linalg.qr(of_transpose)[0]
     # Directions of W that ℓ does not see; those it sees are simple multipliers, outside of ker ℓ.
-    inside = w @ decide(ell.T @ w, absolute=_SEEN).null
-    return decide(np.concatenate([ell, inside], axis=1).T).null
+    inside = w @ truncated_svd(ell.T @ w, absolute=_SEEN).null
+    return truncated_svd(np.concatenate([ell, inside], axis=1).T).null
 
 
 _SEEN = 1e-5  # the cosine of W and ℓ that tells a simple multiplier 1 from a Jordan block
 
 
-def multipliers_of(reduced: Reduced, paired: bool) -> np.ndarray:
+def multipliers_of(reduced: ReducedArcs, paired: bool) -> np.ndarray:
     """Return all 2n multipliers, the largest first; `paired` puts each beside its reciprocal."""
     m = reduced.growth.shape[1]
     values = _product_eigenvalues(reduced.growth) if m else np.zeros(0, complex)
@@ -65,7 +65,7 @@ def multipliers_of(reduced: Reduced, paired: bool) -> np.ndarray:
     return np.concatenate([_pair_reciprocals(values) if paired else values, np.ones(reduced.known, complex)])
 
 
-def passage_determinant(reduced: Reduced, sign: int) -> float:
+def passage_determinant(reduced: ReducedArcs, sign: int) -> float:
     """Return det(1 − sign·G_(K−1) … G_0): zero where a multiplier passes through 1 (`sign` 1) or −1.
 
     It is that of the cyclic matrix, accurate to all digits where two multipliers that meet are known to half of them.

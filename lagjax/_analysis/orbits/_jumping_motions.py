@@ -14,7 +14,7 @@ from jaxtyping import PyTree
 
 from lagjax._interface import Function, Layout, halves
 from lagjax._run import simulate
-from lagjax._run.hybrid import Hybrid, Scene, laws
+from lagjax._run.hybrid import Hybrid, Scene, list_laws
 from lagjax._scene import ROLES
 
 # The budgets of changes of one motion, and of one arc whose derivatives are taken: what they record takes memory.
@@ -47,7 +47,7 @@ class JumpingMotions(NamedTuple):
 
     @property
     def driven(self) -> bool:
-        functions = [getattr(system, role) for system in laws(self.scene) for role in ROLES]
+        functions = [getattr(system, role) for system in list_laws(self.scene) for role in ROLES]
         if isinstance(self.scene, Hybrid):
             functions += [f for transition in self.scene.transitions for f in (transition.guard, transition.reset)]
         return any("t" in function.extras for function in functions if isinstance(function, Function))

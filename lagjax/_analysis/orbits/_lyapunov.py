@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax._analysis.orbits._arc_motions import Arcs, starts
+from lagjax._analysis.orbits._arc_motions import Arcs, check_starts
 from lagjax._interface import SUCCESSFUL, SimulationError, require_flag, show_str
 from lagjax._primitives import accepts_singles, sentence
 from lagjax._run.hybrid import Scene
@@ -86,10 +86,10 @@ def lyapunov_spectrum(
     ```
     """
     require_flag(throw, "throw")
-    durations, layout, y0 = starts(q0, qdot0, duration, "duration")
-    arcs = Arcs.from_system(system, layout, params, rtol, "Lyapunov exponents", may_jump=True)
+    durations, layout, y0 = check_starts(q0, qdot0, duration, "duration")
+    arcs = Arcs.from_system(system, layout, params, rtol, "Lyapunov exponents", jumps=True)
     spans = durations.ravel()
-    run = arcs.ends(np.stack([np.zeros_like(spans), spans], axis=1), y0)
+    run = arcs.integrate(np.stack([np.zeros_like(spans), spans], axis=1), y0)
     if throw and durations.ndim == 0 and run.result[0] != SUCCESSFUL:
         reason = sentence(run.result[0], run.t_end[0], spans[0], run.y_end[0], layout.names)
         raise SimulationError(reason or "", None)
@@ -104,7 +104,7 @@ def _lyapunov_spectra(arcs: Arcs, y0: np.ndarray, duration: np.ndarray, pieces: 
     """Return the exponents (N, 2n) of N motions from y0 (N, 2n), each divided into this many arcs."""
     members, states = y0.shape
     times = duration[:, None] * np.arange(pieces + 1) / pieces
-    run: Any = arcs.ends(times, y0)
+    run: Any = arcs.integrate(times, y0)
     path, modes = run.path, run.modes[:, :-1].ravel() if arcs.jumping else None
     spans = np.stack([times[:, :-1], times[:, 1:]], axis=2).reshape(-1, 2)
     well = np.isfinite(path).all(axis=(1, 2))
@@ -112,10 +112,10 @@ def _lyapunov_spectra(arcs: Arcs, y0: np.ndarray, duration: np.ndarray, pieces: 
     moved = np.full((members * pieces, states, states), np.nan)
     if well.any():
         starts, modes = path[:, :-1].reshape(-1, states)[rows], modes if modes is None else modes[rows]
-        moved[rows] = arcs.follow(spans[rows], starts, modes=modes).by_start
+        moved[rows] = arcs.differentiate(spans[rows], starts, modes=modes).by_start
     units = arcs.units(y0)
-    moved = units.repeat(pieces).growth(moved)
-    chart = arcs.canonical(times.ravel(), path.reshape(-1, states), units.repeat(pieces + 1))
+    moved = units.repeat(pieces).scale_growth(moved)
+    chart = arcs.canonical_charts(times.ravel(), path.reshape(-1, states), units.repeat(pieces + 1))
     chart = chart.reshape(members, pieces + 1, states, states)
     order = np.append(np.arange(states // 2), np.arange(states - 1, states // 2 - 1, -1))
     growth, frame = np.zeros((members, states)), np.tile(np.eye(states), (members, 1, 1))
@@ -130,13 +130,7 @@ def _lyapunov_spectra(arcs: Arcs, y0: np.ndarray, duration: np.ndarray, pieces: 
 
 @accepts_singles(("q0", "qdot0"), ("duration", "params"))
 def lyapunov_exponent(
-    system: System,
-    q0: PyTree,
-    qdot0: PyTree,
-    duration: jax.Array | float,
-    params: PyTree = None,
-    *,
-    rtol: float = 1e-6,
+    system: System, q0: PyTree, qdot0: PyTree, duration: jax.Array | float, params: PyTree = None, *, rtol: float = 1e-6
 ) -> LyapunovExponent:
     """The largest Lyapunov exponent of the motion from (q0, qdot0) over a `duration`, with its standard error.
 
@@ -160,7 +154,7 @@ def lyapunov_exponent(
     lagjax.lyapunov_exponent(scene.system, angles, jnp.zeros((5, 2)), jnp.full(5, 50.0), scene.params).value
     ```
     """
-    durations, layout, y0 = starts(q0, qdot0, duration, "duration")
+    durations, layout, y0 = check_starts(q0, qdot0, duration, "duration")
     arcs = Arcs.from_system(system, layout, params, rtol, "Lyapunov exponents")
     some = [slice(k, k + _MEMBERS) for k in range(0, len(y0), _MEMBERS)]
     value, error = np.concatenate([_largest_exponent(arcs, y0[x], durations.ravel()[x]) for x in some], axis=1)

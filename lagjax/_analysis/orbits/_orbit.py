@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax._analysis.orbits import _shooting
-from lagjax._analysis.orbits._arc_motions import Arcs, starts
-from lagjax._analysis.orbits._floquet import UNCERTAIN, UNSTABLE, multipliers_of, pairing_error, reduce
+from lagjax._analysis.orbits._arc_motions import Arcs, check_starts
+from lagjax._analysis.orbits._floquet import UNCERTAIN, UNSTABLE, multipliers_of, pairing_error, reduce_arcs
 from lagjax._analysis.orbits._shooting import Chain, Closing
-from lagjax._equations import decide, singular_threshold
+from lagjax._equations import singular_threshold, truncated_svd
 from lagjax._interface import SUCCESSFUL, Layout, SimulationError, halves, require_finite, require_flag, require_number
 from lagjax._primitives import accepts_singles
 from lagjax._run.hybrid import Scene
@@ -134,9 +134,9 @@ def periodic_orbit(
     ```
     """
     require_flag(throw, "throw")
-    periods, layout, y0 = starts(q0, qdot0, period, "period")
-    arcs = Arcs.from_system(system, layout, params, RTOL, "Periodic orbits", may_jump=True)
-    found = find(_closing_conditions(arcs, energy, image), y0, periods.ravel())
+    periods, layout, y0 = check_starts(q0, qdot0, period, "period")
+    arcs = Arcs.from_system(system, layout, params, RTOL, "Periodic orbits", jumps=True)
+    found = find_orbits(_closing_conditions(arcs, energy, image), y0, periods.ravel())
     if periods.ndim == 0:
         if throw and not found.ok[0]:
             raise SimulationError(found.message[0], None)
@@ -157,7 +157,7 @@ def _closing_conditions(arcs: Arcs, energy, image) -> Closing:
         energy = float(energy)
         if not arcs.conserves:
             raise ValueError("energy=... asks for an energy, but that of this scene is not conserved: leave it out.")
-    plain = Closing.plain(arcs, energy)
+    plain = Closing.from_arcs(arcs, energy)
     if image is None:
         return plain
     layout, states = arcs.layout, 2 * arcs.size
@@ -172,7 +172,7 @@ def _closing_conditions(arcs: Arcs, energy, image) -> Closing:
     terms = np.abs(matrix) @ np.abs(somewhere) + np.abs(shift)
     if not (np.abs(flat(somewhere) - matrix @ somewhere - shift) <= 1e-12 * terms).all():
         raise ValueError("image must be affine in (q, qdot): a linear map and a shift. Use coordinates in which it is.")
-    if decide(matrix, singular_threshold(states, float)).rank < states:
+    if truncated_svd(matrix, singular_threshold(states, float)).rank < states:
         raise ValueError("image must be invertible: it sends different states to the same one.")
     return plain._replace(matrix=matrix, shift=shift)
 
@@ -189,7 +189,7 @@ class FlatOrbits(NamedTuple):
     message: np.ndarray  # of text
 
 
-def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrbits:
+def find_orbits(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrbits:
     """Return the orbits near these guesses; one that does not close well is tried with more arcs while that helps."""
     arcs = closing.arcs
     counts = arc_counts(arcs, y0, period)
@@ -201,9 +201,9 @@ def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrbits:
         for count in np.unique(counts[waiting]).tolist():
             members = waiting[counts[waiting] == count]
             for some in np.array_split(members, -(-len(members) * count // _PORTION)):
-                parts, y = _shooting.guesses(closing, y0[some], period[some], count)
+                parts, y = _shooting.guess_states(closing, y0[some], period[some], count)
                 units = arcs.units(y0[some], period[some])
-                trial = assess_orbits(closing, _shooting.close(closing, y, period[some], parts, units))
+                trial = assess_orbits(closing, _shooting.close_chains(closing, y, period[some], parts, units))
                 better = ~(found.closure[some] <= trial.closure)
                 gained[some] = better | ~found.ok[some]
                 found = _shooting.replace_members(found, some[better], FlatOrbits(*(x[better] for x in trial)))
@@ -214,10 +214,10 @@ def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrbits:
 
 
 def arc_counts(arcs: Arcs, y0, period) -> np.ndarray:
-    """Return the number of arcs of each orbit, a power of two, from the number of steps of its guess."""
+    """Return the number of arcs into which each orbit is divided, a power of two, from the steps of its guess."""
     if arcs.jumping:  # a state between does not tell the mode
         return np.ones(len(period), int)
-    run = arcs.ends(np.stack([np.zeros(len(period)), period], axis=1), y0)
+    run = arcs.integrate(np.stack([np.zeros(len(period)), period], axis=1), y0)
     share = np.where(run.result == SUCCESSFUL, 1.0, np.clip(run.t_end / period, 1e-3, 1.0))
     count = np.maximum(1.0, run.accepted / share / _STEPS_OF_ARC)
     return np.minimum(MOST_ARCS, 2 ** np.ceil(np.log2(count))).astype(int)
@@ -233,9 +233,9 @@ def assess_orbits(closing: Closing, chain: Chain, most: int | None = None) -> Fl
     multipliers = np.full((len(ok), chain.y.shape[2]), np.nan, complex)
     if ok.any():
         closed = chain.select(ok)
-        known = _shooting.symmetries(closed, most)
+        known = _shooting.find_null_spaces(closed, most)
         for k, place in enumerate(np.flatnonzero(ok).tolist()):
-            multipliers[place] = multipliers_of(reduce(closed.growth[k], *known[k]), closing.arcs.conserves)
+            multipliers[place] = multipliers_of(reduce_arcs(closed.growth[k], *known[k]), closing.arcs.conserves)
     stable = np.abs(np.where(np.isnan(multipliers), np.inf, multipliers)).max(axis=1) < 1 + UNSTABLE
     off = np.array([pairing_error(row) if closing.arcs.conserves else 0.0 for row in multipliers])
     for place in np.flatnonzero(ok & (off > UNCERTAIN)).tolist():

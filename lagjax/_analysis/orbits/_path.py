@@ -25,9 +25,9 @@ import numpy as np
 from jaxtyping import PyTree
 
 from lagjax._analysis.orbits._arc_motions import Arcs, Units
-from lagjax._analysis.orbits._shooting import Chain, Closing, close, equations
+from lagjax._analysis.orbits._shooting import Chain, Closing, close_chains, condense_equations
 from lagjax._engine import concatenate_leaves
-from lagjax._equations import decide
+from lagjax._equations import truncated_svd
 from lagjax._interface import Layout, SimulationError, as_arrays, halves, require_finite, require_flag, require_number
 from lagjax._primitives import accepts_singles
 from lagjax._run import Trajectory, simulate
@@ -189,9 +189,9 @@ def find_path(
     ends = [np.asarray(concatenate_leaves(of_one, np.dtype(float))) for of_one in leaves]
     times = np.linspace(float(t_start), float(t_end), _ARCS + 1)
     first = _guess_states(layout, guess, ends, times)
-    closing = Closing.plain(arcs)._replace(t_first=times[0], q_end=ends[1])
+    closing = Closing.from_arcs(arcs)._replace(t_first=times[0], q_end=ends[1])
     parts = np.linspace(0.0, 1.0, _ARCS + 1)[None]
-    chain = close(closing, first[None], times[-1:] - times[:1], parts, _path_units(arcs, first, ends, times))
+    chain = close_chains(closing, first[None], times[-1:] - times[:1], parts, _path_units(arcs, first, ends, times))
     message = _explain_no_path(closing, chain, times)
     if message:
         if throw:
@@ -237,7 +237,7 @@ def _explain_no_path(closing: Closing, chain: Chain, times) -> str:
     missed = float(chain.closure()[0])
     if missed <= _CLOSED:
         return ""
-    singular = equations(closing, chain).decided.rank[0] < chain.y.shape[2]
+    singular = condense_equations(closing, chain).decided.rank[0] < chain.y.shape[2]
     end = " The ends are conjugate to each other: neighbouring paths all meet there, or none does." if singular else ""
     return (
         f"No path was found {between}: the motions that were tried miss each other by {missed:.2g} of their "
@@ -249,7 +249,7 @@ def _build_path(system: System, arcs: Arcs, chain: Chain, q_start: np.ndarray, t
     restore, states = arcs.layout.restore, chain.y[0] * chain.units.state
     states[0, : arcs.size] = q_start  # exactly, not by way of the units
     conjugate, at_end = _conjugate_times(arcs, states, times, chain.units)
-    (q, qdot), end = map(restore, halves(states[0])), arcs.ends(times[-2:][None], states[-1:]).path[0, -1]
+    (q, qdot), end = map(restore, halves(states[0])), arcs.integrate(times[-2:][None], states[-1:]).path[0, -1]
     qdot, qdot_end = jax.tree.map(jnp.asarray, (qdot, restore(end[arcs.size :])))
     ts = np.linspace(times[0], times[-1], 16 * _ARCS + 1)
     trajectory = simulate(system, q, qdot, ts, params, rtol=RTOL, throw=False)
@@ -263,7 +263,7 @@ def _arc_action(arcs: Arcs, y, t_first, t_last) -> float:
     """Return ∫ L dt along one arc, on eight intervals."""
 
     def lagrangians(times):
-        path = arcs.ends(np.append(t_first, times)[None], y[None]).path[0, 1:]
+        path = arcs.integrate(np.append(t_first, times)[None], y[None]).path[0, 1:]
         return arcs.sample(times, path).quantities("lagrangian")["lagrangian"]
 
     return float(_action_integral(lagrangians, np.linspace(t_first, t_last, 9))[0])
@@ -292,7 +292,9 @@ def _conjugate_times(arcs: Arcs, y: np.ndarray, times: np.ndarray, units: Units)
                 found.append(_locate_conjugate_time(arcs, start, ts[0], ts[j], ts[j + 1], frame, frames[j], nth, units))
         frame = frames[-1]
     found = np.sort(np.array(found))
-    singular = decide(frame[:n], absolute=_AT_END).rank < n  # the first rows B of an orthonormal plane, to rounding
+    singular = (
+        truncated_svd(frame[:n], absolute=_AT_END).rank < n
+    )  # the first rows B of an orthonormal plane, to rounding
     at_end = bool((found > times[-1] - _AT_END * duration).any() or singular)
     return found[found <= times[-1] - _AT_END * duration], at_end
 
@@ -300,22 +302,22 @@ def _conjugate_times(arcs: Arcs, y: np.ndarray, times: np.ndarray, units: Units)
 def _tangent_frames(arcs: Arcs, start, ts, frame, units: Units) -> np.ndarray:
     """Return the tangents (T, 2n, n) at times (T,) that begin as `frame` at the first one."""
     times = np.stack([np.full(len(ts) - 1, ts[0]), ts[1:]], axis=1)
-    arc = arcs.follow(times, np.repeat(start[None], len(times), axis=0))
+    arc = arcs.differentiate(times, np.repeat(start[None], len(times), axis=0))
     # The plane is what counts: its vectors are made orthonormal, so that none outgrows the others.
-    return np.linalg.qr(np.concatenate([frame[None], units.growth(arc.by_start) @ frame]))[0]
+    return np.linalg.qr(np.concatenate([frame[None], units.scale_growth(arc.by_start) @ frame]))[0]
 
 
 def _plane_phases(arcs: Arcs, y, t, frames, units: Units) -> np.ndarray:
     """Return the phases (T, n), ascending in [0, 2π), of the unitary matrices of planes (T, 2n, n) at y (T, 2n)."""
     n = arcs.size
-    canonical = np.linalg.qr(arcs.canonical(t, y, units) @ frames)[0]
+    canonical = np.linalg.qr(arcs.canonical_charts(t, y, units) @ frames)[0]
     b, d = canonical[:, :n], canonical[:, n:]
     unitary = (d + 1j * b) @ np.linalg.inv(d - 1j * b)
     return np.sort(np.mod(np.angle(np.linalg.eigvals(unitary)), 2 * np.pi), axis=1)
 
 
 def _states_on_arcs(arcs: Arcs, start, ts) -> np.ndarray:
-    return arcs.ends(ts[None], start[None]).path[0]
+    return arcs.integrate(ts[None], start[None]).path[0]
 
 
 def _count_turns(before: np.ndarray, after: np.ndarray) -> int:

@@ -23,8 +23,8 @@ import jax
 import numpy as np
 
 from lagjax._analysis.orbits._arc_motions import Arcs, Units
-from lagjax._analysis.orbits._condensation import Condensed, condense
-from lagjax._equations import Decided, decide, singular_threshold
+from lagjax._analysis.orbits._condensation import Condensed, condense_chain
+from lagjax._equations import TruncatedSVD, singular_threshold, truncated_svd
 
 Members = TypeVar("Members")
 
@@ -39,7 +39,7 @@ _ENOUGH = 8e-15  # of the size of the state: round-off, below which trials canno
 
 
 class Closing(NamedTuple):
-    """The conditions on both ends of a chain. An orbit has S y = `matrix` y + `shift`, and an energy if given.
+    """The conditions on a chain. Those of an orbit: S y = `matrix` y + `shift`, and an energy if given.
 
     A path has the given positions: `q_end` (n,), and the one it begins with, at the time `t_first`.
     """
@@ -52,34 +52,34 @@ class Closing(NamedTuple):
     q_end: np.ndarray | None = None
 
     @classmethod
-    def plain(cls, arcs: Arcs, energy: float | None = None) -> "Closing":
+    def from_arcs(cls, arcs: Arcs, energy: float | None = None) -> "Closing":
         return cls(arcs, np.eye(2 * arcs.size), np.zeros(2 * arcs.size), energy)
 
     @property
-    def lasts(self) -> bool:
+    def has_given_duration(self) -> bool:
         """True if the duration is given: that of a path, and the period of a driven scene."""
         return self.arcs.driven or self.q_end is not None
 
-    def free(self) -> tuple[np.ndarray, np.ndarray]:
-        """E and F (2n, 2n): the unknowns u (2n,) change the first state by E u and the last by F u."""
+    def free_directions(self) -> tuple[np.ndarray, np.ndarray]:
+        """E and F (2n, 2n): unknowns u (2n,) change the first state by E u and the last one by F u."""
         whole, n = np.eye(2 * self.arcs.size), self.arcs.size
         if self.q_end is None:
             return whole, whole
         return np.roll(whole, n, axis=0) * (np.arange(2 * n) < n), whole * (np.arange(2 * n) >= n)
 
-    def target(self, y: np.ndarray, end: np.ndarray, of_state: np.ndarray) -> np.ndarray:
+    def arc_targets(self, y: np.ndarray, end: np.ndarray, of_state: np.ndarray) -> np.ndarray:
         """Return the states (B, K, 2n) where arcs from `y` that end at `end` should end, in units of (B, 2n)."""
         target, n = np.roll(y, -1, axis=1), self.arcs.size
         if self.q_end is not None:
             target[:, -1] = np.concatenate([self.q_end / of_state[:, :n], end[:, -1, n:]], axis=1)
         return target
 
-    def conditions(self, y0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def energy_condition(self, y0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the energy error of first states (B, 2n), (B, m), and its gradient (B, m, 2n); m is 0 or 1."""
         if self.energy is None:
             return np.zeros((len(y0), 0)), np.zeros((len(y0), 0, y0.shape[1]))
         off = self.arcs.energy(0.0, y0) - self.energy
-        return off[:, None], self.arcs.energy_slope(0.0, y0)[:, None]
+        return off[:, None], self.arcs.energy_slope(y0)[:, None]
 
 
 class Chain(NamedTuple):
@@ -140,7 +140,7 @@ def replace_members(members: Members, places: np.ndarray, others: Members) -> Me
     return jax.tree.map(replace, members, others)
 
 
-def guesses(closing: Closing, y0: np.ndarray, period: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def guess_states(closing: Closing, y0: np.ndarray, period: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return fractions (B, K + 1) of the period and states (B, K, 2n) there, from starts (B, 2n).
 
     The motion is integrated from both ends to the middle, if the scene is not driven. K is a power of two.
@@ -149,25 +149,25 @@ def guesses(closing: Closing, y0: np.ndarray, period: np.ndarray, count: int) ->
     if count == 1:
         return np.broadcast_to([0.0, 1.0], (len(y0), 2)), y0[:, None].copy()
     if arcs.driven:
-        parts = arcs.equal_shares(period, y0, count)
-        return parts, arcs.ends(period[:, None] * parts, y0).path[:, :count]
+        parts = arcs.divide_evenly(period, y0, count)
+        return parts, arcs.integrate(period[:, None] * parts, y0).path[:, :count]
     half, images = count // 2, y0 @ closing.matrix.T + closing.shift
-    ahead, back = arcs.equal_shares(period / 2, y0, half), arcs.equal_shares(-period / 2, images, half)
-    first = arcs.ends(period[:, None] / 2 * ahead, y0).path
-    second = arcs.ends(-period[:, None] / 2 * back, images).path
+    ahead, back = arcs.divide_evenly(period / 2, y0, half), arcs.divide_evenly(-period / 2, images, half)
+    first = arcs.integrate(period[:, None] / 2 * ahead, y0).path
+    second = arcs.integrate(-period[:, None] / 2 * back, images).path
     parts = np.concatenate([ahead / 2, 1 - back[:, -2::-1] / 2], axis=1)
     return parts, np.concatenate([first, second[:, -2:0:-1]], axis=1)
 
 
-def follow(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray, units: Units) -> Chain:
+def integrate_chain(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray, units: Units) -> Chain:
     """Integrate the arcs from these states, (B, K, 2n), all in these units: a `Chain`."""
     arcs, (chains, count, states) = closing.arcs, y.shape
     of_state, spans = units.state[:, None], (period * units.time)[:, None]
     times = closing.t_first + np.stack([spans * parts[:, :-1], spans * parts[:, 1:]], axis=2).reshape(-1, 2)
     rows = (y * of_state).reshape(-1, states)
-    if not closing.lasts:  # each begins at zero, where times have the most digits
+    if not closing.has_given_duration:  # each begins at zero, where times have the most digits
         times = (spans * np.diff(parts)).reshape(-1, 1) * np.array([0.0, 1.0])
-    arc = arcs.follow(times, rows)
+    arc = arcs.differentiate(times, rows)
     rate = arc.rate.reshape(y.shape)
     ok = np.asarray((arc.ok & arc.returns).reshape(chains, count).all(axis=1))
     end, growth = arc.end.reshape(y.shape), arc.by_start.reshape(*y.shape, states)
@@ -175,61 +175,63 @@ def follow(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarra
     end[:, -1], rate[:, -1] = np.linalg.solve(closing.matrix, (end[:, -1] - closing.shift).T).T, rate[:, -1] @ inverse.T
     growth[:, -1] = inverse @ growth[:, -1]
     end = end / of_state
-    defect = end - closing.target(y, end, units.state)
-    off, slope = closing.conditions(y[:, 0] * units.state)
+    defect = end - closing.arc_targets(y, end, units.state)
+    off, slope = closing.energy_condition(y[:, 0] * units.state)
     rate, slope = rate * units.time[:, None, None] / of_state, slope * of_state
     why = np.full(chains, "", object)
     for k in np.flatnonzero(~ok).tolist():
         row = k * count + int(np.argmin((arc.ok & arc.returns)[k * count : (k + 1) * count]))
-        why[k] = arcs.why_not(row, arc, rows, times[row, 1])
-    return Chain(y, period, parts, units, defect, units.growth(growth), rate, off, slope, ok, why)
+        why[k] = arcs.explain_failure(row, arc, rows, times[row, 1])
+    return Chain(y, period, parts, units, defect, units.scale_growth(growth), rate, off, slope, ok, why)
 
 
 class NewtonEquations(NamedTuple):
     """Newton's equations of B chains, condensed to both ends, with the rank decided; `right` (B, 2n + m).
 
-    The unknowns are u (2n,) of `Closing.free`, and the period if it is free.
+    The unknowns are u (2n,) of `Closing.free_directions`, and the period if it is free.
     """
 
     condensed: Condensed
-    decided: Decided
+    decided: TruncatedSVD
     right: np.ndarray
 
 
-def equations(closing: Closing, chain: Chain) -> NewtonEquations:
-    condensed = condense(chain.growth, np.stack([chain.rate * np.diff(chain.parts)[..., None], chain.defect], axis=3))
-    of_first, of_last = closing.free()
+def condense_equations(closing: Closing, chain: Chain) -> NewtonEquations:
+    condensed = condense_chain(
+        chain.growth, np.stack([chain.rate * np.diff(chain.parts)[..., None], chain.defect], axis=3)
+    )
+    of_first, of_last = closing.free_directions()
     regular, of_period = condensed.first @ of_first + condensed.last @ of_last, condensed.more[..., :1]
     # A condition in units of the state, as the defects are.
     unit = 1 / np.maximum(np.abs(chain.slope).max(axis=2), 1e-300)
     matrix = np.concatenate([regular, unit[:, :, None] * chain.slope], axis=1)
     right = np.concatenate([condensed.more[..., 1], unit * chain.off], axis=1)
-    if not closing.lasts:
+    if not closing.has_given_duration:
         none = np.zeros((len(matrix), chain.off.shape[1], 1))
         matrix = np.concatenate([matrix, np.concatenate([of_period, none], axis=1)], axis=2)
     if closing.q_end is None:
         threshold = np.clip(_PER_DEFECT * chain.merit() / np.maximum(chain.size(), 1e-300), RANK, _LARGEST_RANK)
     else:
         threshold = singular_threshold(chain.y[0].size, float)
-    return NewtonEquations(condensed, decide(matrix, threshold), right)
+    return NewtonEquations(condensed, truncated_svd(matrix, threshold), right)
 
 
-def correction(closing: Closing, chain: Chain) -> tuple[np.ndarray, np.ndarray]:
+def newton_correction(closing: Closing, chain: Chain) -> tuple[np.ndarray, np.ndarray]:
     """Return the Newton step of least norm: dy (B, K, 2n), dT (B,); 0 if the ends of a path are conjugate."""
-    condensed, decided, right = equations(closing, chain)
+    condensed, decided, right = condense_equations(closing, chain)
     step, states = -decided.least_norm(right), chain.y.shape[2]
-    period = np.zeros(len(step)) if closing.lasts else step[:, -1]
-    first, last = (step[:, :states] @ of.T for of in closing.free())
+    period = np.zeros(len(step)) if closing.has_given_duration else step[:, -1]
+    first, last = (step[:, :states] @ of.T for of in closing.free_directions())
     z = np.stack([period, np.ones(len(step))], axis=1)[:, :, None]
-    dy = condensed.inner(first[..., None], last[..., None], z)[..., 0]
+    dy = condensed.expand_solution(first[..., None], last[..., None], z)[..., 0]
     if closing.q_end is not None:
         dy[decided.rank < states] = 0.0
     return dy, period
 
 
-def close(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray, units: Units) -> Chain:
+def close_chains(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray, units: Units) -> Chain:
     """Find the closed chains, or joined paths, near these states; `Chain.closure` is the remaining error."""
-    chain = follow(closing, y / units.state[:, None], period / units.time, parts, units)
+    chain = integrate_chain(closing, y / units.state[:, None], period / units.time, parts, units)
     active = chain.ok.copy()
     for _ in range(_TRIALS):
         active &= chain.merit() > _ENOUGH * chain.size()
@@ -245,13 +247,13 @@ def close(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray
 
 def _damped_newton_step(closing: Closing, chain: Chain) -> Chain:
     """Return each chain after the largest fraction of a Newton step that lowers its defect."""
-    dy, dperiod = correction(closing, chain)
+    dy, dperiod = newton_correction(closing, chain)
     longest = np.minimum(1.0, 0.25 * chain.period / np.maximum(np.abs(dperiod), 1e-300))
     best, waiting = chain, np.arange(len(chain.period))
     for share in _SHARES if closing.q_end is None else _SHARES_OF_PATH:
         here, scale = chain.select(waiting), share * longest[waiting]
         y, period = here.y + scale[:, None, None] * dy[waiting], here.period + scale * dperiod[waiting]
-        trial = follow(closing, y, period, here.parts, here.units)
+        trial = integrate_chain(closing, y, period, here.parts, here.units)
         lower = trial.merit() < (1 - 0.25 * scale) * here.merit()
         near = here.merit() < 1e3 * _ENOUGH * here.size()  # where rounding decides
         best = replace_members(best, waiting[lower], trial.select(lower))
@@ -268,7 +270,7 @@ class Symmetries(NamedTuple):
     of_transpose: np.ndarray
 
 
-def symmetries(chain: Chain, most: int | None = None) -> list[Symmetries]:
+def find_null_spaces(chain: Chain, most: int | None = None) -> list[Symmetries]:
     """Return the null spaces of closed chains, of at most `most` dimensions, by the smallest singular values.
 
     A branch point has one more dimension than the symmetries, which `most` excludes.
@@ -284,12 +286,12 @@ def symmetries(chain: Chain, most: int | None = None) -> list[Symmetries]:
     return found
 
 
-def _closure_null_vectors(growth: np.ndarray) -> tuple[Decided, np.ndarray]:
+def _closure_null_vectors(growth: np.ndarray) -> tuple[TruncatedSVD, np.ndarray]:
     """Return the rank of A + B of closed chains, and the right singular vectors at all states, (B, K, 2n, 2n)."""
     chains, count, states, _ = growth.shape
-    condensed = condense(growth, np.zeros((chains, count, states, 0)))
-    rank = decide(condensed.first + condensed.last, RANK)
-    return rank, condensed.inner(rank.right, rank.right, np.zeros((chains, 0, states)))
+    condensed = condense_chain(growth, np.zeros((chains, count, states, 0)))
+    rank = truncated_svd(condensed.first + condensed.last, RANK)
+    return rank, condensed.expand_solution(rank.right, rank.right, np.zeros((chains, 0, states)))
 
 
 def is_equilibrium(chain: Chain) -> np.ndarray:

@@ -24,15 +24,15 @@ from lagjax._engine._problem import (
     PyTree,
     Solution,
     evaluate_condition,
+    explain_tight_rtol,
     flat_condition,
     signs_of_event,
     solve_in_doubles,
-    too_tight,
 )
 from lagjax._engine._stop_reason import End, find_stop_flags
 from lagjax._engine.diffrax._equations import MotionEquations, equations_of
-from lagjax._engine.diffrax._integrate import Converted, Jumps, Method, WithJumps, integrate
-from lagjax._engine.diffrax._jumps import freeze
+from lagjax._engine.diffrax._integrate import JumpTimes, LiftedFunction, Stepping, WithJumps, integrate
+from lagjax._engine.diffrax._jumps import stop_derivatives
 from lagjax._engine.diffrax._solvers import FineOutput
 from lagjax._equations import forms
 from lagjax._interface import (
@@ -54,7 +54,7 @@ LEAST_RTOL_OF_DIFFRAX = 10
 
 
 def _explain_forward_mode(solve):
-    """Solutions that say what forward mode through recorded steps needs, where JAX would name a `custom_vjp`."""
+    """A decorator: errors say what forward mode over recorded steps needs, instead of `custom_vjp`."""
 
     @functools.wraps(solve)
     def solve_or_explain(self, problem):
@@ -104,7 +104,7 @@ class Diffrax(AbstractEngine, eqx.Module):
         return cls(solver, dt, adjoint, progress)
 
     def refuses(self, problem: Problem) -> str | None:
-        """Why a scene is not for it, or the tolerance, or the number of fixed steps, as the end of a sentence."""
+        """The reason why this solver cannot solve the problem, as the end of a sentence; None if it can."""
         if problem.derivation.kicks:
             return problem.derivation.kick_refusal or (
                 "L, or its momentum p = dL/dqdot, jumps at a border: the velocities jump there, and steps of diffrax "
@@ -115,7 +115,7 @@ class Diffrax(AbstractEngine, eqx.Module):
         if problem.varies:
             return "diffrax does not know the types of jax.shard_map: give it check_vma=False"
         if self.dt is None:
-            return too_tight(self.rtol(problem), problem.layout.dtype, LEAST_RTOL_OF_DIFFRAX)
+            return explain_tight_rtol(self.rtol(problem), problem.layout.dtype, LEAST_RTOL_OF_DIFFRAX)
         if not (is_concrete(self.dt) and is_concrete(problem.ts)):
             return None
         ts = np.asarray(problem.ts)
@@ -133,7 +133,7 @@ class Diffrax(AbstractEngine, eqx.Module):
         return None if self.dt is not None else super().tolerances(problem, y0)
 
     def lacks_memory(self, problem: Problem, members: int = 1) -> str | None:
-        """The memory that a large scene, or `members` like it, takes, as the end of a sentence; None where it is there.
+        """The end of a sentence if `members` of this large scene need more memory than there is; else None.
 
         That are the arrays of L and its gradient, those of M where it is a matrix, some states of a step, and outputs.
         """
@@ -164,8 +164,8 @@ class Diffrax(AbstractEngine, eqx.Module):
         steps = solution.accepted + solution.rejected
         return solution._replace(idle=steps.size * jnp.max(steps) - jnp.sum(steps))
 
-    def method(self, problem: Problem) -> Method:
-        """The steps over this problem."""
+    def stepping(self, problem: Problem) -> Stepping:
+        """The solver, step-size controller and budget with which diffrax integrates this problem."""
         dtype, ts, solver = problem.layout.dtype, jnp.asarray(problem.ts), self.solver
         if solver is None:
             # States between steps are wanted for outputs inside and to locate an event.
@@ -173,13 +173,13 @@ class Diffrax(AbstractEngine, eqx.Module):
             solver = FineOutput(diffrax.Dopri8()) if between else diffrax.Dopri8()
         if (tolerances := self.tolerances(problem, problem.y0)) is None:
             dt0 = jnp.asarray(self.dt, dtype) * jnp.sign(ts[-1] - ts[0])
-            return Method(solver, diffrax.ConstantStepSize(), dt0, problem.max_steps, self.progress)
+            return Stepping(solver, diffrax.ConstantStepSize(), dt0, problem.max_steps, self.progress)
         # Below this a step no longer moves the time reliably.
         smallest = 4 * jnp.finfo(dtype).eps * jnp.maximum(abs(ts[0]), abs(ts[-1]))
         controller = diffrax.PIDController(*tolerances, norm=_norm_or_inf, dtmin=smallest, force_dtmin=False)
         if (jumps := _table_jump_times(problem)) is not None:
             controller = WithJumps(controller, jumps)
-        return Method(solver, controller, None, problem.max_steps, self.progress, jumps)
+        return Stepping(solver, controller, None, problem.max_steps, self.progress, jumps)
 
 
 _STATES = 20  # that a step of Dopri8 holds: its stages, their sums, and errors
@@ -187,7 +187,7 @@ _STATES = 20  # that a step of Dopri8 holds: its stages, their sums, and errors
 _AT_END = 256  # diffrax lets a step that ends up to 100 roundings before the end of the motion end there
 
 
-def _table_jump_times(problem: Problem) -> Jumps | None:
+def _table_jump_times(problem: Problem) -> JumpTimes | None:
     """The times inside the motion at which its program looks up another entry of a table; None without any.
 
     One at an end of the motion is moved inside by some roundings, so that only one tiny step sees it.
@@ -208,7 +208,7 @@ def _table_jump_times(problem: Problem) -> Jumps | None:
     ends = jnp.asarray(problem.ts)[jnp.array([0, -1])]
     low, high, shift = ends.min(), ends.max(), _AT_END * jnp.finfo(knots.dtype).eps * jnp.abs(knots)
     inside = (knots >= low) & (knots <= high)
-    return Jumps.from_times(jnp.where(inside, jnp.clip(knots, low + shift, high - shift), jnp.inf))
+    return JumpTimes.from_times(jnp.where(inside, jnp.clip(knots, low + shift, high - shift), jnp.inf))
 
 
 def _norm_or_inf(error: PyTree) -> jax.Array:
@@ -223,10 +223,10 @@ def _solve_problem(engine: Diffrax, problem: Problem) -> Solution:
     form, y0 = equations_of(derivation), jnp.asarray(problem.y0)
 
     # A member that cannot start is given no time to integrate over: it costs nothing, and the others do not wait.
-    start = _check_acceleration(y0, *form.acceleration(*freeze((given[0], halves(y0), numbers))))
+    start = _start_result(y0, *form.acceleration(*stop_derivatives((given[0], halves(y0), numbers))))
     ts = jnp.where(start == RESULTS.successful, given, given[0])
     event, is_located = (None, True) if problem.event is None else _flatten_event(problem, ts, y0, numbers)
-    method = engine.method(problem)
+    method = engine.stepping(problem)
     if form.constrained:  # a start that was typed, or is rounded to float32; the way to it is no error of a step
         y0 = jnp.concatenate(form.projected(given[0], halves(y0), numbers))
     solution = integrate(form, method, engine.adjoint, event, ts, y0, numbers)
@@ -257,26 +257,26 @@ def _solve_problem(engine: Diffrax, problem: Problem) -> Solution:
 # ---- what stopped a motion -------------------------------------------------------------------------------------------
 
 
-def _check_acceleration(y, acceleration, singular) -> RESULTS:
-    """The result code of a motion from a state with this acceleration: successful if it can go on."""
+def _start_result(y, acceleration, singular) -> RESULTS:
+    """The result code at a state (2n,) with this acceleration (n,), and a flag that M is singular."""
     finite = jnp.isfinite(y).all() & jnp.isfinite(acceleration).all()
     failed = jnp.where(singular, code_of(RESULTS.mass_matrix_singular), code_of(RESULTS.nonfinite_state))
     return result_from(jnp.where(finite, SUCCESSFUL, failed))
 
 
 def _explain_result(solution: Solution, form: MotionEquations, start: RESULTS, ts, numbers) -> RESULTS:
-    """The most telling of what diffrax reports, of the first and the last state, and of what the motion ran into."""
+    """The result code that tells most: of diffrax's, of those at the first and last state, and of a jump just ahead."""
     # A name has no derivative, and the search for it is a loop that reverse mode could not go back through.
-    ts, solution, numbers = freeze((ts, solution, numbers))
+    ts, solution, numbers = stop_derivatives((ts, solution, numbers))
     last = halves(solution.y_end)
-    end = _check_acceleration(solution.y_end, *form.acceleration(solution.t_end, last, numbers))
+    end = _start_result(solution.y_end, *form.acceleration(solution.t_end, last, numbers))
     result = result_from(solution.result)
     stopped = (result != RESULTS.successful) & (result != RESULTS.event_occurred)
     unhealthy = (end != RESULTS.successful) & (stopped | (end == RESULTS.nonfinite_state))
     result = RESULTS.where(unhealthy, end, result)
     result = RESULTS.where(start == RESULTS.successful, result, start)
 
-    field = freeze(Converted.from_function(form.acceleration, ts[0], last, numbers))
+    field = stop_derivatives(LiftedFunction.from_function(form.acceleration, ts[0], last, numbers))
 
     def acceleration(t, y):
         return field(t, halves(y), numbers)[0]
@@ -289,7 +289,7 @@ def _explain_result(solution: Solution, form: MotionEquations, start: RESULTS, t
 
 
 def _flatten_event(problem: Problem, ts, y0, numbers) -> tuple[diffrax.Event, bool]:
-    """The event whose conditions take the solver's state (2n,), and whether all instants of it are located.
+    """The event for diffrax, whose conditions take flat states (2n,); and a flag that all instants are located.
 
     That of a comparison is where its difference is zero. If it holds at the start, it is the start.
     """

@@ -12,13 +12,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from lagjax._equations import Derivation, Motion
 from lagjax._interface import compiled_once, halves
 from lagjax._tracing import Program
 
-PyTree = Any
 Vector = Float[Array, " n"]
 State = tuple[Vector, Vector]  # q and q̇
 Time = Float[Array, ""]
@@ -26,7 +25,7 @@ Acceleration = tuple[Vector, Bool[Array, ""]]  # q̈, and whether the matrix tha
 
 
 class MotionEquations(eqx.Module):
-    """The equations of a scene by two functions of (q, q̇, t, params), each traced once, however often it is called."""
+    """The acceleration and the projection of a scene, functions of (q, q̇, t, params), each traced once."""
 
     motion: Motion = eqx.field(static=True)
     accelerate: Any = eqx.field(static=True)

@@ -21,18 +21,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
+from jaxtyping import PyTree
 
 from lagjax._engine._problem import Solution
 from lagjax._engine.diffrax._equations import MotionEquations
-from lagjax._engine.diffrax._jumps import AdaptiveWrapper, Noting, NotingAdaptive, freeze, may_jump
+from lagjax._engine.diffrax._jumps import (
+    AdaptiveJumpRecorder,
+    AdaptiveWrapper,
+    JumpRecorder,
+    may_jump,
+    stop_derivatives,
+)
 from lagjax._engine.diffrax._solvers import Projected
 from lagjax._interface import ENDED_WELL, RESULTS, SUCCESSFUL, code_of, halves
 from lagjax._primitives import differentiable_where, vary_alike
 
-PyTree = Any
 
-
-class Method(eqx.Module):
+class Stepping(eqx.Module):
     """The stepping of diffrax: its solver, its controller, the fixed size of steps (None if adaptive), their budget."""
 
     solver: diffrax.AbstractSolver
@@ -40,11 +45,11 @@ class Method(eqx.Module):
     dt0: jax.Array | None
     max_steps: int = eqx.field(static=True)
     progress: diffrax.AbstractProgressMeter
-    jumps: "Jumps | None" = None  # where adaptive steps end and begin anew
+    jumps: "JumpTimes | None" = None  # where adaptive steps end and begin anew
 
 
-class Converted(eqx.Module):
-    """A function whose closed-over arrays, `constants`, are its leaves.
+class LiftedFunction(eqx.Module):
+    """A function whose closed-over arrays became leaves, `constants`, of this pytree.
 
     `equinox.filter_closure_convert` insists on arguments that vary along the same axes of a mesh as the examples: under
     `jax.shard_map` a start that all members share does not, and a state on the way does.
@@ -55,7 +60,7 @@ class Converted(eqx.Module):
     structure: Any = eqx.field(static=True)
 
     @classmethod
-    def from_function(cls, function: Callable, *examples: PyTree) -> "Converted":
+    def from_function(cls, function: Callable, *examples: PyTree) -> "LiftedFunction":
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*examples)
         return cls(closed.consts, closed.jaxpr, jax.tree.structure(shapes))
 
@@ -64,7 +69,7 @@ class Converted(eqx.Module):
         return jax.tree.unflatten(self.structure, results)
 
 
-def integrate(form: MotionEquations, method: Method, adjoint, event, ts, y0, params: PyTree) -> Solution:
+def integrate(form: MotionEquations, method: Stepping, adjoint, event, ts, y0, params: PyTree) -> Solution:
     """ẏ = f(t, y) from y0 = (q, q̇), (2n,), at ts[0] to ts[-1], or to the event. Outputs not reached are infinite.
 
     The state is one array: two of them take a solver twice as many operations of half the size.
@@ -83,8 +88,8 @@ def integrate(form: MotionEquations, method: Method, adjoint, event, ts, y0, par
 
     leaves, structure = jax.tree.flatten((ts, y0, params))
     ts, y0, params = structure.unflatten(vary_alike(leaves))
-    field = Converted.from_function(vector_field, ts[0], y0, params)
-    project = Converted.from_function(projected, ts[0], y0, params) if form.constrained else None
+    field = LiftedFunction.from_function(vector_field, ts[0], y0, params)
+    project = LiftedFunction.from_function(projected, ts[0], y0, params) if form.constrained else None
     jumps = functools.partial(may_jump, form.motion)
     solution = _integrate_differentiably((field, project, ts, y0, params), method, jumps, adjoint, event)
     if project is not None:
@@ -93,37 +98,37 @@ def integrate(form: MotionEquations, method: Method, adjoint, event, ts, y0, par
     return solution
 
 
-def _integrate_differentiably(moving, method: Method, jumps: Callable, adjoint, event) -> Solution:
+def _integrate_differentiably(moving, method: Stepping, jumps: Callable, adjoint, event) -> Solution:
     if adjoint is not None or event is not None:
         adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
         _, _, ts, y0, params = moving
         if isinstance(adjoint, diffrax.BacksolveAdjoint) or not jumps(ts[0], y0, params):
             return _call_diffrax(moving, method, adjoint, event)[0]
         # It is not known here by what this will be differentiated: parameters count as fixed.
-        solution, _, crossed = _call_diffrax(moving, _note_jumps(moving, method, None), adjoint, event)
+        solution, _, crossed = _call_diffrax(moving, _record_jumps(moving, method, None), adjoint, event)
         y_end, path = (differentiable_where(~crossed, x) for x in (solution.y_end, solution.path))
         return solution._replace(path=path, y_end=y_end)
     # Tolerances and the smallest step follow from ts and the dtype; like all that sizes a step, they are data here.
-    return _solve_and_record(moving, freeze(method), jumps)
+    return _solve_and_record(moving, stop_derivatives(method), jumps)
 
 
-def _note_jumps(moving, method: Method, varied) -> Method:
-    """The method whose controller notes steps across a jump of the field that moves with the state or with `varied`."""
+def _record_jumps(moving, method: Stepping, varied) -> Stepping:
+    """The stepping whose controller records if a step crosses a jump; `varied` as for `crosses_jump`."""
     field, _, _, _, params = moving
     varied = jax.tree.map(lambda _: False, (field, params)) if varied is None else varied
     adaptive = isinstance(method.controller, diffrax.AbstractAdaptiveStepSizeController)
-    noting: Any = NotingAdaptive if adaptive else Noting
+    noting: Any = AdaptiveJumpRecorder if adaptive else JumpRecorder
     return eqx.tree_at(lambda m: m.controller, method, noting(method.controller, field, varied))
 
 
-def _call_diffrax(moving, method: Method, adjoint, event=None, *more: diffrax.SubSaveAt) -> tuple[Solution, Any, Any]:
-    """The solution, what `more` diffrax saves, and whether a step crossed a jump, where that is noted."""
+def _call_diffrax(moving, method: Stepping, adjoint, event=None, *more: diffrax.SubSaveAt) -> tuple[Solution, Any, Any]:
+    """diffrax's solution, the outputs of further `SubSaveAt`s, and a flag that a step crossed a jump (if recorded)."""
     field, project, ts, y0, params = moving
     solver = method.solver if project is None else Projected(method.solver, project)
     # Of the ends alone there is nothing to interpolate, and no test of `ts` by a call back to the host.
     outputs = diffrax.SubSaveAt(t0=True, t1=True) if len(ts) == 2 else diffrax.SubSaveAt(ts=ts)
     saved = [outputs, diffrax.SubSaveAt(t1=True), *more]
-    notes = isinstance(method.controller, Noting)
+    notes = isinstance(method.controller, JumpRecorder)
     done: Any = diffrax.diffeqsolve(
         diffrax.ODETerm(field),
         _set_stage_loop(solver, adjoint),
@@ -157,7 +162,7 @@ _CODES = np.array([
 
 
 def _set_stage_loop(solver, adjoint):
-    """The solver with a stage loop that the adjoint can differentiate, which diffrax sees to unless it is wrapped."""
+    """The solver with a loop over stages that the adjoint can differentiate; for wrapped solvers."""
     if isinstance(solver, diffrax.AbstractRungeKutta):
         return solver
     kinds = {diffrax.ForwardMode: "lax", diffrax.RecursiveCheckpointAdjoint: "checkpointed"}
@@ -184,7 +189,7 @@ def _integrate_and_record(perturbed, moving, method, jumps):
     varied = of_field, of_params
     _, _, ts, y0, params = moving
     if any(jax.tree.leaves((varied, of_start))) and jumps(ts[0], y0, params):
-        method = _note_jumps(moving, method, varied)
+        method = _record_jumps(moving, method, varied)
     solution, (times,), crossed = _call_diffrax(moving, method, diffrax.ForwardMode(), None, record)
     residuals = times, solution.t_end, solution.result, crossed
     well = jnp.isin(solution.result, jnp.asarray(ENDED_WELL, solution.result.dtype))
@@ -204,7 +209,7 @@ def _replay_backward(residuals, cotangents, perturbed, moving, method, jumps):
         ts = jnp.where(result == SUCCESSFUL, ts, reached)
         # The last step ends at ts[-1] itself, which may be differentiated, not at its recorded value.
         controller = _RecordedSteps(jnp.where(times == t_end, jnp.inf, times), method.jumps)
-        again = Method(method.solver, controller, None, method.max_steps, diffrax.NoProgressMeter())
+        again = Stepping(method.solver, controller, None, method.max_steps, diffrax.NoProgressMeter())
         solution, *_ = _call_diffrax((field, project, ts, y0, params), again, _checkpoint_count(y0, method.max_steps))
         return solution[:3]
 
@@ -224,10 +229,10 @@ def _checkpoint_count(y0, max_steps: int) -> diffrax.RecursiveCheckpointAdjoint:
 
 
 class _RecordedSteps(diffrax.AbstractStepSizeController):
-    """Steps that end at given times, padded with inf (after which the end of the integration is the next)."""
+    """A controller that repeats recorded steps: it takes their end times (K,), padded with infinity."""
 
     times: jax.Array
-    jumps: "Jumps | None"
+    jumps: "JumpTimes | None"
 
     def wrap(self, direction):
         times = jnp.where(jnp.isinf(self.times), jnp.inf, self.times * direction)
@@ -241,14 +246,14 @@ class _RecordedSteps(diffrax.AbstractStepSizeController):
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
         next_ = self.times.at[controller_state].get(mode="fill", fill_value=jnp.inf)
-        begin, jumps = (t1, False) if self.jumps is None else self.jumps.next_start(t1)
+        begin, jumps = (t1, False) if self.jumps is None else self.jumps.skip_jump(t1)
         return True, begin, next_, jumps, controller_state + 1, diffrax.RESULTS.successful
 
 
 # ---- where the field jumps at known times ----------------------------------------------------------------------------
 
 
-class Jumps(eqx.Module):
+class JumpTimes(eqx.Module):
     """Times at which the field jumps, (K,) in increasing order: a step ends at `before`, the next begins at `behind`.
 
     That is a few roundings off, because a stage at the end of a step, t₀ + h, may be rounded onto the jump; to leave
@@ -259,25 +264,25 @@ class Jumps(eqx.Module):
     behind: jax.Array
 
     @classmethod
-    def from_times(cls, times: jax.Array) -> "Jumps":
+    def from_times(cls, times: jax.Array) -> "JumpTimes":
         """The jumps at times (K,), in any order."""
         times = jnp.sort(times)
         gap = 4 * jnp.finfo(times.dtype).eps * jnp.where(jnp.isfinite(times), jnp.abs(times), 0.0)
         return cls(times - gap, times + gap)
 
-    def reversed(self, direction) -> "Jumps":
+    def reversed(self, direction) -> "JumpTimes":
         """The jumps in a time that is multiplied by `direction`, 1 or −1; those at infinity stay at +∞."""
         one, other = self.before * direction, self.behind * direction
         low, high = jnp.minimum(one, other), jnp.maximum(one, other)
-        return Jumps(*(jnp.sort(jnp.where(jnp.isfinite(x), x, jnp.inf)) for x in (low, high)))
+        return JumpTimes(*(jnp.sort(jnp.where(jnp.isfinite(x), x, jnp.inf)) for x in (low, high)))
 
-    def next_start(self, t):
-        """The time at which the step after one that ended at t begins, and whether that is behind a jump."""
+    def skip_jump(self, t):
+        """The start time of the step after one that ended at t, and a flag: a jump lies between them."""
         begin = _exchange_times(t, self.before, self.behind)
         return begin, begin != t
 
-    def first(self, begin, end):
-        """`end`, or the first jump on the way from `begin` to it."""
+    def limit_end(self, begin, end):
+        """The step end: `end`, or the first jump between `begin` and it."""
         ahead = jnp.searchsorted(self.before, begin, side="right")
         return jnp.minimum(end, self.before.at[ahead].get(mode="fill", fill_value=jnp.inf))
 
@@ -292,9 +297,9 @@ class WithJumps(AdaptiveWrapper):
     """The steps of a controller, which end before every jump and go on behind it."""
 
     controller: Any  # an adaptive one: `wrap` of diffrax does not say so of what it returns
-    jumps: Jumps
+    jumps: JumpTimes
 
-    def __init__(self, controller: Any, jumps: Jumps):
+    def __init__(self, controller: Any, jumps: JumpTimes):
         self.controller, self.jumps = controller, jumps
 
     def wrap(self, direction):
@@ -302,9 +307,9 @@ class WithJumps(AdaptiveWrapper):
 
     def init(self, terms, t0, *arguments):
         end, state = self.controller.init(terms, t0, *arguments)
-        return self.jumps.first(t0, end), state
+        return self.jumps.limit_end(t0, end), state
 
     def adapt_step_size(self, *arguments):
         keep, begin, end, made_jump, state, result = self.controller.adapt_step_size(*arguments)
-        behind, jumps = self.jumps.next_start(begin)
-        return keep, behind, self.jumps.first(behind, end + (behind - begin)), made_jump | jumps, state, result
+        behind, jumps = self.jumps.skip_jump(begin)
+        return keep, behind, self.jumps.limit_end(behind, end + (behind - begin)), made_jump | jumps, state, result

@@ -36,13 +36,13 @@ _DECIDING = frozenset((
 ))  # fmt: skip
 
 
-def freeze(tree):
-    """The tree, whose arrays have no derivatives."""
+def stop_derivatives(tree):
+    """The pytree with `stop_gradient` of all its arrays."""
     return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
 
 def may_jump(motion: Motion, t, y, params) -> bool:
-    """True if F or γ has operations in it that decide on something; those of an elimination leave q̈ smooth."""
+    """True if F or γ contain a decision (a comparison, |x|, sign, …); those of eliminations leave q̈ smooth."""
     parts = [motion.force, *([motion.constraints.gamma] if motion.constrained else [])]
     return any(_makes_decisions(jax.make_jaxpr(part)(*halves(y), t, params).jaxpr) for part in parts)
 
@@ -52,7 +52,7 @@ def _makes_decisions(jaxpr) -> bool:
     return decides or any(map(_makes_decisions, core.subjaxprs(jaxpr)))
 
 
-def crosses(field, varied, begin, end, params) -> jax.Array:
+def crosses_jump(field, varied, begin, end, params) -> jax.Array:
     """True if the step between two pairs (t, y) crosses a jump of the field that moves with the state or `varied`.
 
     `field(t, y, params)` is ẏ (2n,) of y = (q, q̇); `varied` a pair like (field, params), of Booleans.
@@ -93,7 +93,7 @@ def crosses(field, varied, begin, end, params) -> jax.Array:
 
 
 def _perturb(tree, varied, by):
-    """The tree with the floats of its varied leaves a little larger or smaller, by different amounts."""
+    """The pytree with each float of the leaves `varied` changed by `by` times a factor of its own."""
     draws = np.random.default_rng(1)
 
     def move(leaf, moves):
@@ -123,12 +123,12 @@ class AdaptiveWrapper(diffrax.AbstractAdaptiveStepSizeController):
         return self.controller.norm
 
 
-class Noting(diffrax.AbstractStepSizeController):
-    """The steps of a controller; its state stands beside a flag, whether a step that was accepted crossed a jump."""
+class JumpRecorder(diffrax.AbstractStepSizeController):
+    """A step-size controller whose state also has a flag: an accepted step crossed a jump of the acceleration."""
 
     controller: Any
     field: Any
-    varied: Any  # as for `crosses`
+    varied: Any  # as for `crosses_jump`
     direction: Any = 1  # or −1, the sign of the time of diffrax, which integrates forward
 
     def wrap(self, direction):
@@ -143,10 +143,12 @@ class Noting(diffrax.AbstractStepSizeController):
         keep, *more, state, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, state
         )
-        field, *step = freeze((self.field, (t0 * self.direction, y0), (t1 * self.direction, y1_candidate), args))
-        here = keep & crosses(field, self.varied, *step)
+        field, *step = stop_derivatives(
+            (self.field, (t0 * self.direction, y0), (t1 * self.direction, y1_candidate), args)
+        )
+        here = keep & crosses_jump(field, self.varied, *step)
         return keep, *more, (state, crossed | here), result
 
 
-class NotingAdaptive(Noting, AdaptiveWrapper):
-    """`Noting` of a controller whose steps adapt."""
+class AdaptiveJumpRecorder(JumpRecorder, AdaptiveWrapper):
+    """`JumpRecorder` of a controller whose steps adapt."""

@@ -15,8 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-
-PyTree = Any
+from jaxtyping import PyTree
 
 
 class _SolverWrapper(diffrax.AbstractAdaptiveSolver):
@@ -51,11 +50,6 @@ def _correction_weights() -> np.ndarray:
 
 
 _CORRECTION = _correction_weights()
-
-
-def _hermite_slope(place, rise, first, last):
-    """The slope at `place` in [0, 1] of the cubic from 0 to `rise` whose slopes at the ends are `first` and `last`."""
-    return 6 * place * (1 - place) * rise + (1 - place) * (1 - 3 * place) * first + place * (3 * place - 2) * last
 
 
 class _CorrectedHermite(diffrax.AbstractLocalInterpolation):
@@ -141,7 +135,11 @@ class FineOutput(_SolverWrapper):
 
         def correction(y0, y1, k, inside):
             places = jnp.asarray(_INSIDE, y0.dtype).reshape(-1, *[1] * y0.ndim)
-            residuals = inside - _hermite_slope(places, y1 - y0, k[0], k[-1])
+            other = 1 - places  # the slope of Hermite's cubic there: from y1 − y0, then from the slopes at both ends
+            slopes = (
+                6 * places * other * (y1 - y0) + other * (1 - 3 * places) * k[0] + places * (3 * places - 2) * k[-1]
+            )
+            residuals = inside - slopes
             return jnp.tensordot(jnp.asarray(_CORRECTION, y0.dtype), residuals, axes=1)
 
         # A loop, as XLA compiles each call of the equations anew.

@@ -20,14 +20,14 @@ import numpy as np
 from lagjax._engine._problem import AbstractEngine, Batch, Problem, Solution, solve_in_doubles
 from lagjax._engine.taylor import _primitives
 from lagjax._engine.taylor._crossing import (
-    Noted,
+    FoundCrossings,
     motion_to_event,
     motion_with_crossings,
     run_stretch,
     surfaces_of,
     surfaces_of_event,
 )
-from lagjax._engine.taylor._derivatives import Motions, jvp, portions, project_start_tangents, vjp
+from lagjax._engine.taylor._derivatives import Motions, jvp, project_start_tangents, split_portions, vjp
 from lagjax._engine.taylor._flow import Flow, Tolerances, require_fit
 from lagjax._engine.taylor._line_functions import Line, line_of
 from lagjax._engine.taylor._lowered_motion import lowered_motion
@@ -145,20 +145,22 @@ class MachineCode(AbstractEngine):
 
     def refuses_crossings(self, problem: Problem, surfaces: Surfaces) -> str | None:
         """The reason why it cannot find crossings of these surfaces, as the end of a sentence; None if it can."""
-        return self.refuses(_note_crossings(problem, surfaces))
+        return self.refuses(_record_crossings(problem, surfaces))
 
-    def crossings(self, problem: Problem, surfaces: Surfaces, room: int, slack: float = 1.0) -> tuple[Solution, Noted]:
+    def crossings(
+        self, problem: Problem, surfaces: Surfaces, room: int, slack: float = 1.0
+    ) -> tuple[Solution, FoundCrossings]:
         """The motion of one member, and the crossings of its surfaces, at most `room` for each.
 
         Derivatives have the accuracy of a tolerance that is `slack` times as large.
         """
         if problem.is_single:
             return solve_in_doubles(lambda problem: self.crossings(problem, surfaces, room, slack), problem)
-        noting, flow = flow_of(_note_crossings(problem, surfaces)), _unguarded_flow(problem)
+        noting, flow = flow_of(_record_crossings(problem, surfaces)), _unguarded_flow(problem)
         tolerances = tolerances_of(problem)._replace(notes=room, slack=slack)
         if problem.is_known:
             solution = _run_one(noting, problem, tolerances)
-            return solution, Noted.read(solution.path, len(surfaces.directions))
+            return solution, FoundCrossings.read(solution.path, len(surfaces.directions))
         ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
         given = noting, flow, surfaces, tolerances
         return _primitives.compile_once(motion_with_crossings, *given)(ts, y0, params)
@@ -209,7 +211,7 @@ def make_flow(derivation: Derivation, path: str, guards: Guards | None) -> Flow:
     return flow
 
 
-def _note_crossings(problem: Problem, surfaces: Surfaces) -> Problem:
+def _record_crossings(problem: Problem, surfaces: Surfaces) -> Problem:
     return dataclasses.replace(problem, event=None, guards=surfaces.guards(notes=True))
 
 

@@ -28,7 +28,7 @@ from lagjax._program import Unlowerable
 _BEFORE = 64 * np.finfo(np.float64).eps  # of the largest time: more than the rounding of a time, and of a border's
 
 
-class Noted(NamedTuple):
+class FoundCrossings(NamedTuple):
     """The crossings of each of G surfaces, at most `room`, NaN after the last one."""
 
     t: Any  # (G, room)
@@ -36,7 +36,7 @@ class Noted(NamedTuple):
     count: Any  # (G,), how many there were
 
     @classmethod
-    def read(cls, path, surfaces: int) -> "Noted":
+    def read(cls, path, surfaces: int) -> "FoundCrossings":
         """The crossings in the `path` of a motion that records them, (G (room + 1), 2n + 1)."""
         rows = path.reshape(surfaces, -1, path.shape[-1])
         return cls(rows[:, :-1, 0], rows[:, :-1, 1:], rows[:, -1, 0])
@@ -47,9 +47,9 @@ class Noted(NamedTuple):
 
 def surfaces_of_event(problem: Problem) -> Surfaces:
     """The functions of an event as surfaces. Raises `Unlowerable` if machine code cannot evaluate them."""
-    if "surfaces" not in problem.made:
-        problem.made["surfaces"] = _surfaces_of_event(problem)
-    return problem.made["surfaces"]
+    if "surfaces" not in problem.engine_parts:
+        problem.engine_parts["surfaces"] = _surfaces_of_event(problem)
+    return problem.engine_parts["surfaces"]
 
 
 def _surfaces_of_event(problem: Problem) -> Surfaces:
@@ -163,15 +163,15 @@ def run_stretch(
 
 def motion_with_crossings(
     noting: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params
-) -> tuple[Solution, Noted]:
+) -> tuple[Solution, FoundCrossings]:
     """The motion to the last of `ts`, and its crossings, with first and second derivatives."""
     still = jax.lax.stop_gradient
     solution = jax.tree.map(still, _primitives.run(noting, tolerances, still(ts), still(y0), still(params)))
-    noted = Noted.read(solution.path, len(surfaces.directions))
+    noted = FoundCrossings.read(solution.path, len(surfaces.directions))
     run_again = _crossings_variation(flow, surfaces, tolerances._replace(notes=0))
     t, y = attach_derivative(run_again, (noted.t, noted.y), ts, y0, params, noted.t)
     there, inputs = jnp.isfinite(noted.t), (ts, y0, params)
-    return solution, Noted(
+    return solution, FoundCrossings(
         undefined_unless(there, t, inputs), undefined_unless(there[..., None], y, inputs), noted.count
     )
 

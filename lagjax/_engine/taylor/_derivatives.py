@@ -52,7 +52,7 @@ class Motions(NamedTuple):
     def from_solution(cls, ts, y0, params, solution: Solution) -> "Motions":
         return cls(ts, y0, params, solution.path, solution.result, solution.accepted, solution.rejected)
 
-    def take(self, rows: np.ndarray) -> "Motions":
+    def select_members(self, rows: np.ndarray) -> "Motions":
         """The members `rows` (R,); arrays with one row, shared by all, are kept."""
         shared = [len(x) == 1 and name in ("ts", "params") for name, x in self._asdict().items()]
         return Motions(*(x if alike else x[rows] for x, alike in zip(self, shared, strict=True)))
@@ -74,7 +74,7 @@ def jvp(flow: Flow, motions: Motions, dy0, dparams, tolerances: Tolerances) -> t
     padded = (np.pad(x, padding).reshape(members * groups, directions, -1) for x in (dy0, dparams))
     *dots, unit = scale_directions(*padded)
     rows = np.repeat(np.arange(members), groups)
-    path_dot, y_dot = _jvp_over_steps(flow, motions.take(rows), dots, tolerances)
+    path_dot, y_dot = _jvp_over_steps(flow, motions.select_members(rows), dots, tolerances)
     of_groups = path_dot * unit[..., None], y_dot * unit
     path_dot, y_dot = (x.reshape(members, groups * directions, *x.shape[2:])[:, :m] for x in of_groups)
     if flow.projection is not None and path.shape[1] > 2:
@@ -112,7 +112,7 @@ def _jvp_over_steps(flow: Flow, motions: Motions, dots, tolerances) -> tuple[np.
     path_dot = np.full((*dy0.shape[:2], *motions.path.shape[1:]), np.nan)
 
     def advance_tangents(steps: Steps):
-        rows, of = steps.rows, motions.take(steps.rows)
+        rows, of = steps.rows, motions.select_members(steps.rows)
         given = of.ts, of.params, steps, dy0[rows], dparams[rows]
         path_dot[rows], y_dot[rows], excess = steps.kernel.jvp(*given, tolerances.floor)
         return excess / tolerances.largest_excess, (path_dot[rows], y_dot[rows])
@@ -121,7 +121,7 @@ def _jvp_over_steps(flow: Flow, motions: Motions, dots, tolerances) -> tuple[np.
         path_dot[row], y_dot[row] = np.nan, np.nan
         if (m := dy0.shape[1]) > 1:  # steps may suit some of these directions
             alone = [x[row, :, None] for x in dots]
-            of_each = _jvp_over_steps(flow, motions.take(np.full(m, row)), alone, tolerances)
+            of_each = _jvp_over_steps(flow, motions.select_members(np.full(m, row)), alone, tolerances)
             path_dot[row], y_dot[row] = (x[:, 0] for x in of_each)
     return start_outputs(motions.ts, dy0, path_dot), y_dot
 
@@ -147,7 +147,7 @@ def vjp(flow: Flow, motions: Motions, path_ct, end_ct, tolerances: Tolerances) -
         back = _differentiate_projection(pullback, flow.projection, *_inner_states(motions), inner)
         inner[:], params_ct = back[..., : flow.states], back[..., flow.states :].sum(axis=2)
 
-    of_rows = motions.take(np.repeat(np.arange(members), m))
+    of_rows = motions.select_members(np.repeat(np.arange(members), m))
     go_back = functools.partial(_vjp_over_steps, flow, of_rows, tolerances=tolerances)
     path_ct, end_ct = (x.reshape(members * m, *x.shape[2:]) for x in (path_ct, end_ct))
     y_ct, more = (x.reshape(members, m, -1) for x in transpose_outputs(go_back, of_rows.ts, path_ct, end_ct))
@@ -187,7 +187,7 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
         directions = np.eye(some := min(inputs, MOST_PROBES))[:, np.arange(inputs) % some]
 
     def transpose_steps(steps: Steps):
-        rows, of = steps.rows, motions.take(steps.rows)
+        rows, of = steps.rows, motions.select_members(steps.rows)
         given = of.ts, of.params, steps, path_ct[rows], end_ct[rows]
         y_ct[rows], params_ct[rows], excess = steps.kernel.vjp(*given)
         return excess / tolerances.largest_excess, None
@@ -198,7 +198,7 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
         Inputs without a derivative are left out, since a NaN tangent gives no information. After a passage tangents
         fall strongly along one direction and not along others: there several are followed.
         """
-        of = motions.take(steps.rows)
+        of = motions.select_members(steps.rows)
         found = np.isfinite(np.concatenate([y_ct[steps.rows], params_ct[steps.rows]], axis=1))
         y_dot, params_dot = np.split(np.where(found[:, None], directions, 0.0), [flow.states], axis=2)
         *tangents, excess = steps.kernel.jvp(of.ts, of.params, steps, y_dot, params_dot, tolerances.floor)
@@ -206,7 +206,7 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
         return np.where(is_finite, excess / tolerances.largest_excess, np.nan), tangents
 
     if lost := list(_differentiate_steps(flow, motions, tolerances, transpose_steps, probe)):
-        of = motions.take(np.array(lost))
+        of = motions.select_members(np.array(lost))
         inner = path_ct[lost] * (of.ts != of.ts[:, :1])[..., None]
         inner[:, -1] = 0.0
         again = _vjp_by_jacobian(flow, of, inner[:, None], end_ct[lost, None], tolerances)
@@ -282,13 +282,13 @@ def _differentiate_steps(
         long = np.flatnonzero(excess > limit)
         if not long.size:
             continue
-        steps = steps.take(long)
+        steps = steps.select_members(long)
         excess = excess[long] if probe is go else probe(steps)[0]
 
         for k in np.flatnonzero(~(excess <= limit)).tolist():
             row = int(steps.rows[k])
             numbers = motions.params[row if len(motions.params) > 1 else 0]
-            better = _suitable_steps(flow, steps.take([k]), numbers, tolerances, excess[k : k + 1], probe)
+            better = _suitable_steps(flow, steps.select_members([k]), numbers, tolerances, excess[k : k + 1], probe)
             if better is None:
                 yield row
             elif probe is not go:
@@ -305,16 +305,16 @@ def _record_steps(flow: Flow, motions: Motions, tolerances: Tolerances) -> Itera
 
     To keep those of the first run would save a twentieth of the time in most cases, and a fifth at most.
     """
-    for places in portions(np.arange(len(motions.y0)), motions.accepted * (flow.states + 4), LARGEST_PORTION):
-        again = motions.take(places)
+    for places in split_portions(np.arange(len(motions.y0)), motions.accepted * (flow.states + 4), LARGEST_PORTION):
+        again = motions.select_members(places)
         room = _ROOM_AGAIN * int(again.accepted.sum()) + int(again.rejected.sum()) + len(places)
-        for steps in flow.follow(*again[:3], tolerances, room)[1]:
+        for steps in flow.run_and_record(*again[:3], tolerances, room)[1]:
             if not has_passages(steps.kernel):
                 yield steps._replace(rows=places[steps.rows])
                 continue
             for k, row in enumerate(steps.rows):
-                of = again.take(np.array([row]))
-                parted = part_passages(flow, steps.take([k]), of.params[0], again.path[row, -1], tolerances)
+                of = again.select_members(np.array([row]))
+                parted = part_passages(flow, steps.select_members([k]), of.params[0], again.path[row, -1], tolerances)
                 yield parted._replace(rows=places[[row]])
 
 
@@ -363,7 +363,7 @@ def _divide_steps(flow: Flow, steps: Steps, params, tolerances: Tolerances) -> S
     return cut_steps(flow, steps, cuts, params, tolerances)
 
 
-def portions(places: np.ndarray, numbers: np.ndarray, largest: int) -> list[np.ndarray]:
+def split_portions(places: np.ndarray, numbers: np.ndarray, largest: int) -> list[np.ndarray]:
     """The indices `places` in portions that need at most `largest` numbers together, or a single index."""
     if not len(places):
         return []

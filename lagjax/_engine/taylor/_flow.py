@@ -179,7 +179,7 @@ class Flow:
         Result codes tell what stopped a member, beyond steps that became too small or too many. A run that a handler
         has `begun` is resumed.
         """
-        solution, _ = self.follow(ts, y0, params, tolerances, begun=begun)
+        solution, _ = self.run_and_record(ts, y0, params, tolerances, begun=begun)
         if (solution.result != SUCCESSFUL).any():
             solution = self._explain_stops(solution, ts, params)
         finite = np.isfinite(solution.y_end)
@@ -187,7 +187,7 @@ class Flow:
             solution.result[~finite.all(axis=1)] = _NOT_FINITE
         return solution
 
-    def follow(self, ts, y0, params, tolerances, room: int = 0, begun=None) -> tuple[Solution, list[Steps]]:
+    def run_and_record(self, ts, y0, params, tolerances, room: int = 0, begun=None) -> tuple[Solution, list[Steps]]:
         """As `run`, without analysis of what stopped a member; and the recorded steps of members, up to `room`."""
         rtol, atol, max_steps, notes, order = *tolerances[:3], tolerances.notes, tolerances.order
         done = self.kernel.select_width(len(y0))(ts, y0, params, rtol, atol, max_steps, room, begun, notes, order)
@@ -198,14 +198,14 @@ class Flow:
             counts, order = done.steps[rows], order or _native.choose_order(rtol)
             found.append(Steps(done.table, np.cumsum(counts) - counts, counts, order, self.kernel, rows))
         if not (result == SUCCESSFUL).all():
-            again, flow, tolerances = self._members_to_repeat(solution, ts, params, tolerances)
+            again, flow, tolerances = self._members_to_repeat(solution, params, tolerances)
             if again.any():
-                some_ts, some_y0, some_params = members(again, ts, y0, params)
-                better, steps_again = flow.follow(some_ts, some_y0, some_params, tolerances, room)
+                some_ts, some_y0, some_params = select_members(again, ts, y0, params)
+                better, steps_again = flow.run_and_record(some_ts, some_y0, some_params, tolerances, room)
                 for values, new in zip(solution[:-1], better[:-1], strict=True):
                     values[again] = new
                 solution, places = solution._replace(idle=done.idle + better.idle), np.flatnonzero(again)
-                found = [steps.take(~again[steps.rows]) for steps in found]
+                found = [steps.select_members(~again[steps.rows]) for steps in found]
                 found += [steps._replace(rows=places[steps.rows]) for steps in steps_again]
         return solution, [steps for steps in found if len(steps.rows)]
 
@@ -228,7 +228,7 @@ class Flow:
         """The accelerations q̈ (N, n) at N states."""
         return self.general_program.evaluate_many([*y.T, t, *params.T])[: self.size].T
 
-    def _members_to_repeat(self, solution, ts, params, tolerances: Tolerances) -> "tuple[np.ndarray, Flow, Tolerances]":
+    def _members_to_repeat(self, solution, params, tolerances: Tolerances) -> "tuple[np.ndarray, Flow, Tolerances]":
         """The members to run once more, with which flow and which tolerances.
 
         A program that assumes a regular mass matrix is replaced by the general one, which is long if a recursion in L
@@ -272,6 +272,6 @@ class Flow:
         return Flow(parts, rows * n, rows * self.numbers, None, groups, nesting, general, self._motion_program)
 
 
-def members(chosen: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:
+def select_members(chosen: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:
     """The rows where the mask `chosen` (N,) is true, of each array; an array of one row is shared by all."""
     return [x[chosen] if len(x) == len(chosen) else x for x in arrays]

@@ -48,7 +48,7 @@ def transpose_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params, path_ct
     Raises `Unlowerable` if a GPU cannot transpose the steps of this scene.
     """
     program, row = flow.kernel.gpu_programs.transpose(tolerances.rtol)
-    members, threads = len(y0), math.prod(gpu.grid(gpu.TRANSPOSE, len(y0)))
+    members, threads = len(y0), math.prod(gpu.grid_size(gpu.TRANSPOSE, len(y0)))
     room = min(tolerances.max_steps, gpu.LARGEST_RECORD // (threads * row))
     arrays = _launch_inputs(gpu.TRANSPOSE, ts, y0, params, flow, tolerances, room=room)
     arrays |= {"path_ct": path_ct, "end_ct": end_ct}
@@ -71,7 +71,7 @@ def _launch_inputs(entry: gpu.Entry, ts, y0, params, flow: Flow, tolerances: Tol
 
 def launch(entry: gpu.Entry, program: str, members: int, arrays: dict[str, Any], shapes: list[tuple]) -> list:
     """Launch a GPU program for this many members on the `arrays` of its entry; its results have these shapes."""
-    blocks, threads = gpu.grid(entry, members)
+    blocks, threads = gpu.grid_size(entry, members)
     sizes = dict(grid_x=blocks, grid_y=1, grid_z=1, block_x=threads, block_y=1, block_z=1, shared_mem_bytes=0)
     attributes = {name: np.int32(size) for name, size in sizes.items()}
     results = [jax.ShapeDtypeStruct((1,), np.int64), *(jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes)]

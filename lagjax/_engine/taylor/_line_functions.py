@@ -56,7 +56,7 @@ LANES = 8  # rows of a line that one call evaluates side by side: as many as the
 MOST_IN_LANES = 2048  # numbers of a row, in all lanes 128 kB of the stack of a thread
 
 
-def outputs(program: Program, count: int, first, numbers):
+def program_outputs(program: Program, count: int, first, numbers):
     """The first `count` outputs (…, count) at inputs in two parts, `first` (…, m) and `numbers` (…, P)."""
     floats = all(dtype.kind == "f" for dtype in program.dtypes) and jnp.result_type(first) == np.dtype(float)
     if program.looks_up or not floats:

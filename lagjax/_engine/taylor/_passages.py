@@ -77,4 +77,4 @@ def cut_steps(flow: Flow, steps: Steps, cuts: list[np.ndarray], params, toleranc
 def _states_at_times(flow: Flow, times, t, first, params, tolerances: Tolerances) -> np.ndarray:
     """The states of a motion at `times` in between, from its `first` state; `t` has its own times, start and end."""
     ts = np.concatenate([t[:1], times, t[-1:]])
-    return flow.follow(ts[None], first[None], params[None], tolerances)[0].path[0, 1:-1]
+    return flow.run_and_record(ts[None], first[None], params[None], tolerances)[0].path[0, 1:-1]

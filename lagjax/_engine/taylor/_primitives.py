@@ -41,7 +41,7 @@ from lagjax._engine.taylor._call import (
 from lagjax._engine.taylor._derivatives import Motions
 from lagjax._engine.taylor._flow import Flow, Tolerances
 from lagjax._engine.taylor._gpu_launch import run_on_gpu, transpose_on_gpu
-from lagjax._engine.taylor._line_functions import outputs
+from lagjax._engine.taylor._line_functions import program_outputs
 from lagjax._engine.taylor._passages import has_passages
 from lagjax._engine.taylor._state_rates import rate
 from lagjax._engine.taylor._variational import from_rows, to_rows
@@ -190,7 +190,9 @@ def _project_direction(flow: Flow, t, y0, params, dy0, dparams):
 
     def differentiate_start(t, y, p, dy, dp):
         def start(y, p):
-            return outputs(cast(Program, cast(Projection, flow.projection).state), flow.states, jnp.append(y, t), p)
+            return program_outputs(
+                cast(Program, cast(Projection, flow.projection).state), flow.states, jnp.append(y, t), p
+            )
 
         return jax.jvp(start, (y, p), (dy, dp))[1]
 
@@ -497,7 +499,7 @@ def _go_back_on_gpu(motions: Motions, path_ct, end_ct, *, flow, tolerances):
     if has_passages(flow.kernel):
         return None
     members, m = end_ct.shape[:2]
-    ts, y0, params, *_ = motions.take(np.repeat(np.arange(members), m))
+    ts, y0, params, *_ = motions.select_members(np.repeat(np.arange(members), m))
     path_ct, end_ct = (x.reshape(members * m, *x.shape[2:]) for x in (path_ct, end_ct))
     go_back = functools.partial(transpose_on_gpu, flow, tolerances, ts, y0, params)
     try:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from lagjax._engine.taylor._flow import Flow
-from lagjax._engine.taylor._line_functions import join_columns, outputs
+from lagjax._engine.taylor._line_functions import join_columns, program_outputs
 from lagjax._tracing import Rows, emit_look_up, emit_rows
 
 INSTANT = 1e-9  # of the time; what a border is off by while a motion slides along it is rounding
@@ -28,7 +28,7 @@ def rate(flow: Flow, t, y, params):
         found = _evaluate_pieces(borders, rows, _pieces_at_state(borders, rows, n))[0][:n]
         acceleration = jnp.stack(jnp.broadcast_arrays(*found), axis=-1)
     else:
-        acceleration = outputs(program, n, rows.first, params)
+        acceleration = program_outputs(program, n, rows.first, params)
     slope = join_columns(y[..., n:], acceleration)
     return jnp.where(jnp.isfinite(slope), slope, 0.0)
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from lagjax._engine.taylor._line_functions import outputs
+from lagjax._engine.taylor._line_functions import program_outputs
 from lagjax._equations import Derivation, forms
 from lagjax._native import SINGLE_NOISE, Guards
 from lagjax._primitives import differentiable_where
@@ -217,7 +217,7 @@ def jumps_through_zero(surfaces: Surfaces, k, t, y, numbers):
 def _follow_guards(surfaces: Surfaces, t, y, numbers) -> list:
     """The guards and border distances, their rates along the motion, and the rate of the state."""
     program, n = surfaces.followed(), y.shape[0] // 2
-    found = outputs(program, len(program.line.outputs), jnp.append(y, t), numbers)
+    found = program_outputs(program, len(program.line.outputs), jnp.append(y, t), numbers)
     return jnp.split(found, [len(found) // 2 - n, len(found) - 2 * n])
 
 

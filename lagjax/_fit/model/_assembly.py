@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._engine import DEFAULT_RTOL
 from lagjax._equations import has_constraints
@@ -26,9 +27,8 @@ from lagjax._fit.model._signals import Signals
 from lagjax._fit.model._timings import Clock, Timings, build_clock
 from lagjax._interface import Layout, find_params_expression
 from lagjax._primitives import DOUBLE
-from lagjax._run.hybrid import Scene, first_law, jumps, require_scene
+from lagjax._run.hybrid import Scene, first_law, may_jump, require_scene
 
-PyTree = Any
 _HOLDING = "constraints", "contacts", "one_way", "slip"  # the ends of roles of functions that hold a start
 
 
@@ -90,7 +90,7 @@ def _assemble_system(given: GivenSystem, parameters: Parameters, law: AbstractNo
         sensor = Sensor(*(np.append(x, np.nan) for x in sensor))
     fitted = np.array([record.begins is None or isinstance(record.begins, Guess) for record in records])
     manifold, scene = None, first_law(system)
-    if jumps(system) and isinstance(observe, Delayed):
+    if may_jump(system) and isinstance(observe, Delayed):
         raise ValueError("Sensors of contacts and hybrid motion cannot be lagjax.Delayed: shift the times instead.")
     asking = input_functions(scene)
     if (has_constraints(scene) or scene.touches) and not any(role.endswith(_HOLDING) for role in asking):
@@ -119,7 +119,7 @@ def _require_motion(given: GivenSystem, recordings: list[Record], signals: Signa
     """Raise `ValueError` where signals, but of hybrid motion, jump by a period, or where starts are fitted to rest."""
     of_state, wrap = sensors(given.observe)
     for place, record in enumerate(given.records):
-        if isinstance(record, Record) and not jumps(given.system) and wrap is None:
+        if isinstance(record, Record) and not may_jump(given.system) and wrap is None:
             require_no_jumps(record, f"records[{place}]", signals.names, of_state is None)
     still = constant_signals(recordings, signals.names)
     if len(still) == len(signals.names) * len(given.records) > 0 and all(one.begins is None for one in given.records):

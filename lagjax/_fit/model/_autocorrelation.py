@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import solve_toeplitz
 
-from lagjax._fit.model._noise import NoiseScale, scores
+from lagjax._fit.model._noise import NoiseScale, likelihood_slopes
 from lagjax._fit.model._residuals import Residuals, Trial
 
 
 class Correlation(NamedTuple):
-    """The autocorrelation of a signal at lags 0, 1, …, tapered to zero; its sum over all lags; the samples' number."""
+    """The autocorrelation of a signal: lags 0, 1, … tapered to zero, their sum over all lags, the number of samples."""
 
     lags: np.ndarray
     time: float
@@ -57,7 +57,7 @@ def _residual_products(residuals: Residuals, point: Trial, noise: NoiseScale, si
     sums, count = np.zeros(1), 0
     for batch, r in zip(residuals.batches, point.residuals, strict=True):
         z = np.sqrt(batch.weights[..., signal]) * r[..., signal] / noise.sigma[signal]
-        z, curvature = scores(z, None if batch.sides is None else batch.sides[..., signal])
+        z, curvature = likelihood_slopes(z, None if batch.sides is None else batch.sides[..., signal])
         if not np.isinf(dof):
             z = z * (dof + 1) / (dof + z**2)  # what enters the likelihood's slope
         counted = batch.weights[..., signal] > 0

@@ -24,7 +24,7 @@ from lagjax._primitives import accepts_singles
 
 
 class PosteriorUnknowns(NamedTuple):
-    """One vector x taken apart: u (F,), the starts of all records (N, 2n), and the noise σ (S,), ν (S,)."""
+    """The parts of a vector x of all unknowns: u (F,), the starts (N, 2n), and the noise σ (S,), ν (S,)."""
 
     u: Any
     starts: Any
@@ -87,7 +87,7 @@ class Density:
         return len(self.first)
 
     def unknowns(self, x) -> PosteriorUnknowns:
-        """A vector (D,) taken apart."""
+        """The parts of a vector x (D,)."""
         u, starts = x[: len(self.residuals.parameters)], jnp.asarray(self.point.starts, x.dtype)
         starts = jnp.where(self.start_places < len(self), jnp.append(x, 0.0)[self.start_places], starts)
         starts = self.residuals.trace_starts(starts, u)

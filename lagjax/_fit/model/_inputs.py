@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
-from lagjax._run.hybrid import Hybrid, Scene, Transition, laws
+from lagjax._run.hybrid import Hybrid, Scene, Transition, list_laws
 from lagjax._scene import (
     MARGINS,
     DrivenParams,
@@ -27,7 +28,6 @@ from lagjax._scene import (
     samples,
 )
 
-PyTree = Any
 _LEAST_ROOM, _GROWTH = 16, 4  # of tables: at most four times what is needed, and six programs up to 16 000 samples
 
 
@@ -103,7 +103,7 @@ def split_leaves(flat, tree, shapes: tuple[tuple[int, ...], ...]) -> PyTree:
 
 
 def input_functions(scene: Scene) -> list[str]:
-    return [role for law in laws(scene) for role in roles_with_inputs(law)]
+    return [role for law in list_laws(scene) for role in roles_with_inputs(law)]
 
 
 def table_length(count: int) -> int:

@@ -33,10 +33,8 @@ from lagjax._interface import ENDED_WELL, Layout, halves
 from lagjax._native import Projection
 from lagjax._primitives import sentence
 from lagjax._run import simulate
-from lagjax._run.hybrid import Scene, begin_in, first_law, jumps
+from lagjax._run.hybrid import Scene, begin_in, first_law, may_jump
 from lagjax._scene import ContactParams, Contacts, ContactScene, DrivenParams, FlatContacts, System
-
-PyTree = Any
 
 
 class RecordMotion(NamedTuple):
@@ -91,7 +89,7 @@ def choose_motions(
 ) -> AbstractMotions:
     form = form if input_functions(system) else None  # inputs that only sensors ask for, or nothing
     scene = system if form is None else form.drive_scene(system)
-    if not isinstance(scene, System) or jumps(scene):
+    if not isinstance(scene, System) or may_jump(scene):
         return _JaxMotions(scene, layout, parameters, {"rtol": rtol}, form is not None)
 
     def problem(room: int) -> Problem:

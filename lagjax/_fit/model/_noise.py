@@ -22,8 +22,8 @@ the motion lies is not known better than that, so over an offset that is equally
     E ε(x) = 0,    E ε(x) ε(y) = Σₖ aₖ cos(2πk (x − y)/h),    aₖ = h²/(2π²k²) exp(−(2πk s/h)²),    Σₖ aₖ ≤ h²/12
 
 with s the noise before rounding. At rest all errors are one and the same; where the motion advances by a step or more
-from sample to sample, or the noise is as large as half of one, they are independent. `worths` is what samples are
-worth, and `rounding_square` what least squares with any weights make of such errors: its intervals need no more.
+from sample to sample, or the noise is as large as half of one, they are independent. `sample_worths` counts independent
+samples, `rounding_square` gives what least squares with any weights make of such errors: its intervals need no more.
 Source: Widrow & Kollár, *Quantization Noise* (2008), ch. 4 and 11.
 """
 
@@ -75,7 +75,7 @@ class Sensor(NamedTuple):
 
 
 class AbstractNoise(abc.ABC):  # noqa: B024
-    """A law for the scatter of measurements, which is normal where the law says no more."""
+    """A law for the scatter of measurements; unless it says otherwise, the scatter is normal."""
 
     def estimate(self, residuals: np.ndarray, weights: np.ndarray, least: np.ndarray, sides=None) -> NoiseScale:
         """The noise of S signals that makes these residuals (M, S) likeliest; no σ is smaller than `least` (S,).
@@ -86,14 +86,14 @@ class AbstractNoise(abc.ABC):  # noqa: B024
         sigma = np.sqrt((weights * residuals**2).sum(axis=0, where=counted) / np.maximum(counted.sum(axis=0), 1))
         noise = NoiseScale(np.maximum(sigma, least), np.full(len(least), np.inf))
         for _ in range(_ROUNDS if sides is not None else 0):
-            score, curvature = scores(np.sqrt(weights) * residuals / noise.sigma, sides)
+            score, curvature = likelihood_slopes(np.sqrt(weights) * residuals / noise.sigma, sides)
             squares, counts = (x.sum(axis=0, where=weights > 0) for x in (score**2, curvature))
             share = squares / np.maximum(counts, 1e-9)
             noise = noise._replace(sigma=np.maximum(noise.sigma * np.sqrt(share), least))
         return noise
 
     def sensor(self, records: list[Record]) -> "Sensor | None":
-        """The sensors of these records; None where the records are to tell."""
+        """The sensors that this law states for the records; None: they are to be found in the values."""
         return None
 
 
@@ -205,13 +205,13 @@ class StudentT(AbstractNoise):
 
     def _fit_signal(self, scaled: np.ndarray, least: float) -> tuple[float, float]:
         if self.dof is not None:
-            return _sigma(scaled, self.dof, least), float(self.dof)
+            return _likeliest_sigma(scaled, self.dof, least), float(self.dof)
         # The profile likelihood of log ν has one maximum, or its end.
-        cost = lambda x: -t.logpdf(scaled, np.exp(x), scale=_sigma(scaled, np.exp(x), least)).mean()  # noqa: E731
+        cost = lambda x: -t.logpdf(scaled, np.exp(x), scale=_likeliest_sigma(scaled, np.exp(x), least)).mean()  # noqa: E731
         ends = np.log(LEAST_DOF), np.log(MOST_DOF)
         best: Any = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 3e-3})
         dof = float(np.exp(best.x))
-        return _sigma(scaled, dof, least), dof
+        return _likeliest_sigma(scaled, dof, least), dof
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ class KnownNoise(AbstractNoise):
         return self.known
 
 
-def _sigma(scaled: np.ndarray, dof: float, least: float) -> float:
+def _likeliest_sigma(scaled: np.ndarray, dof: float, least: float) -> float:
     """σ of the likeliest Student distribution of ν = `dof` for residuals times the root of their weights."""
     squares = scaled**2
     variance = max(float(np.median(squares)), least**2)
@@ -236,8 +236,8 @@ def _sigma(scaled: np.ndarray, dof: float, least: float) -> float:
     return float(np.sqrt(variance))
 
 
-def scores(z: np.ndarray, sides: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """The slope and the curvature of −log L by x/σ of samples of standardised size z; `sides` as for `estimate`."""
+def likelihood_slopes(z: np.ndarray, sides: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """First and second derivatives of −log L by x/σ at standardised residuals z (M, S); `sides` as for `estimate`."""
     if sides is None:
         return z, np.ones_like(z)
     u = sides * z
@@ -247,12 +247,12 @@ def scores(z: np.ndarray, sides: np.ndarray | None) -> tuple[np.ndarray, np.ndar
     return np.where(sides == 0, z, -sides * mills), np.where(sides == 0, 1.0, curvature)
 
 
-def counts(noise: NoiseScale, residuals: np.ndarray, weights: np.ndarray, sides=None) -> np.ndarray:
-    """The weight of each sample in the next sum of squares of e/σ, in the shape of the residuals."""
+def sample_counts(noise: NoiseScale, residuals: np.ndarray, weights: np.ndarray, sides=None) -> np.ndarray:
+    """The weight of each sample (M, S) in the next iteration of reweighted least squares."""
     z = np.sqrt(weights) * residuals / noise.sigma
     with np.errstate(invalid="ignore"):  # ∞/∞ where the noise is Gaussian
         robust = np.where(np.isinf(noise.dof), 1.0, (noise.dof + 1) / (noise.dof + z**2))
-    return weights * robust * scores(z, sides)[1]
+    return weights * robust * likelihood_slopes(z, sides)[1]
 
 
 def log_likelihood(noise: NoiseScale, residuals: np.ndarray, weights: np.ndarray, sides=None) -> float:
@@ -269,20 +269,20 @@ _LAG = 1.2  # ratio of the lags at which neighbours are compared: how many there
 _HARMONICS = 20  # of the errors' covariance: what they leave, 3 % of step²/12, counts as independent
 
 
-def harmonics(step: float, sigma: float) -> tuple[np.ndarray, float, float]:
+def rounding_harmonics(step: float, sigma: float) -> tuple[np.ndarray, float, float]:
     """aₖ (K,) for errors of standard deviation `sigma`; the independent variance of rounding; that before rounding."""
     k, before = np.arange(1, _HARMONICS + 1), max(sigma**2 - step**2 / 12, 0.0)
     a = step**2 / (2 * (np.pi * k) ** 2) * np.exp(-((2 * np.pi * k) ** 2) * before / step**2)
     return a, step**2 / 12 - float(a.sum()), before
 
 
-def worths(x: np.ndarray, step: float, sigma: float) -> np.ndarray:
+def sample_worths(x: np.ndarray, step: float, sigma: float) -> np.ndarray:
     """The number of independent samples that each sample of a signal is worth, whose exact values are near x (T,).
 
     A sample shares its rounding error with its m neighbours up to half a step away, on both sides as far as none is
     further, and is worth 1/(1 + (m − 1) ρ) with ρ the share of the variance that they have in common.
     """
-    rho, many = min(float(harmonics(step, sigma)[0].sum()) / sigma**2, 1.0), np.ones(len(x))
+    rho, many = min(float(rounding_harmonics(step, sigma)[0].sum()) / sigma**2, 1.0), np.ones(len(x))
     lags = np.unique(np.round(_LAG ** np.arange(np.log(len(x) + 1) / np.log(_LAG))).astype(int))
     for way in (1, -1):
         left = np.arange(len(x))
@@ -296,7 +296,7 @@ def worths(x: np.ndarray, step: float, sigma: float) -> np.ndarray:
 def rounding_square(rows: list[np.ndarray], x: list[np.ndarray], step: float, sigma: float) -> np.ndarray:
     """E (Σ Gᵢ εᵢ)(Σ Gᵢ εᵢ)ᵀ of common rounding errors, over rows (N, T, F) of batches with values near x (N, T)."""
     total = np.zeros((rows[0].shape[-1],) * 2)
-    for k, a in enumerate(harmonics(step, sigma)[0], start=1):
+    for k, a in enumerate(rounding_harmonics(step, sigma)[0], start=1):
         each = [np.einsum("ntf,nt->f", g, np.exp(2j * np.pi * k / step * at)) for g, at in zip(rows, x, strict=True)]
         sums = np.sum(each, axis=0)
         total += a * np.real(sums[:, None] * sums.conj())

@@ -17,12 +17,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._fit.model._law_parameters import find_laws, plain_dicts
 from lagjax._fit.model._transforms import AbstractTransform, Smooth, Unbounded
 from lagjax._interface import as_arrays, labelled_leaves, require_finite
-
-PyTree = Any
 
 
 class _PerRecord:
@@ -53,8 +52,10 @@ per_record = _PerRecord()
 
 
 class Part(NamedTuple):
-    """The numbers of one leaf that are free: where they stand among all numbers, how they may move, and the record of
-    each unknown that moves them, −1 for all records."""
+    """The free numbers of one leaf.
+
+    Their places among all numbers, their transform, and the record of each unknown that moves them, −1 for all records.
+    """
 
     label: str
     places: np.ndarray
@@ -123,7 +124,7 @@ class Parameters:
         return cls(leaves, tree, np.concatenate(numbers), every, np.arange(records), tuple(names), tuple(parts))
 
     def select(self, rows) -> "Parameters":
-        """The same parameters for records each of which has the numbers of the record `rows` (M,) of these."""
+        """The parameters of M records that have the numbers of the records `rows` (M,) of these."""
         return replace(self, places=self.places[rows], owners=self.owners[rows])
 
     @functools.cached_property
@@ -162,11 +163,11 @@ class Parameters:
         return self.cuts[-1][0].stop if self.parts else 0
 
     def inverse(self, values: np.ndarray) -> np.ndarray:
-        """The unknowns u (F,) at which the free ones among all `values` stand."""
+        """The unknowns u (F,) whose free numbers are those among all `values` (P,)."""
         return np.concatenate([np.zeros(0), *(part.transform.inverse(values[part.places]) for part in self.parts)])
 
     def numbers(self, u, xp: Any = np):
-        """All numbers where the free ones stand at u (F,)."""
+        """All numbers (P,) at unknowns u (F,)."""
         if xp is np:
             values = self.first.copy()
             values[self.free_places] = self.values(u)
@@ -174,7 +175,7 @@ class Parameters:
         return xp.asarray(self.first, u.dtype).at[self.free_places].set(self.values(u, xp))
 
     def values(self, u, xp: Any = np):
-        """The free numbers (X,) at u (F,); infinite where a step of the search led too far, which is a lost trial."""
+        """The free numbers (X,) at unknowns u (F,); infinite beyond the range of floats: a trial that fails."""
         with np.errstate(over="ignore", invalid="ignore"):
             return xp.concatenate([u[:0], *[part.transform.value(u[own], xp) for own, _, part in self.cuts]])
 
@@ -225,7 +226,7 @@ class Parameters:
         return low, high
 
     def covariance(self, u: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-        """The covariance (X, X) of free numbers from that of u (F, F): infinite, with NaN beside it, where u's is."""
+        """The covariance (X, X) of the free numbers from that of u, (F, F); infinite, with NaN beside it, as there."""
         jacobian, unseen = self.jacobian(u), ~np.isfinite(np.diag(matrix))
         finite = np.where(unseen[:, None] | unseen, 0.0, matrix)
         moved = jacobian @ finite @ jacobian.T
@@ -254,7 +255,7 @@ class Parameters:
         return replace(self, parts=tuple(parts))
 
     def draw(self, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Another place (F,) to begin a search from; the numbers of one record, like its start, follow the others."""
+        """Random unknowns (F,) to begin a search from; numbers of a single record keep their values."""
         drawn = np.concatenate([u[:0], *(part.transform.draw(u[own], rng) for own, _, part in self.cuts)])
         return np.where(self._owner_of < 0, drawn, u)
 
@@ -294,7 +295,7 @@ class Parameters:
 
     @property
     def room(self) -> np.ndarray:
-        """The distance from one value of each u (F,) at which others are distinct."""
+        """The distance (F,) from one value of each u to the next that counts as different."""
         return np.array([transform.room for transform in self.maps])
 
     def sizes(self, u: np.ndarray) -> np.ndarray:
@@ -319,7 +320,10 @@ class Parameters:
         return rows[0]
 
     def unknown(self, name: str) -> int:
-        """The place of the unknown that moves the free number of this name (`row`) alone. Raises `ValueError`."""
+        """The index of the unknown that moves the free number called `name` (`row`), and no other.
+
+        Raises `ValueError`.
+        """
         row = self.row(name)
         name = self.names[row]
         own, rows, part = next(cut for cut in self.cuts if cut[1].start <= row < cut[1].stop)
@@ -411,7 +415,7 @@ class Unknowns(NamedTuple):
 
     @property
     def shared(self) -> np.ndarray:
-        """The places of the shared unknowns (L − own,)."""
+        """The indices (L − own,) of the unknowns that all records share."""
         return self.columns[0, self.own :]
 
     def select(self, rows) -> "Unknowns":

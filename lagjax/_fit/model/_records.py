@@ -9,12 +9,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._fit.model._inputs import split_leaves
 from lagjax._interface import Layout, labelled_leaves, require_concrete
 from lagjax._scene import unevenly_spaced
 
-PyTree = Any
 _NO_PREFIX = "{} must be one number, or a prefix of the structure and shapes of values."
 
 

@@ -32,7 +32,15 @@ from lagjax._engine import Solution
 from lagjax._fit.model._blas import one_blas_thread
 from lagjax._fit.model._inputs import constant_tables, input_functions, inputs_at
 from lagjax._fit.model._motions import AbstractMotions, Manifold, Origins, RecordMotion
-from lagjax._fit.model._noise import AbstractNoise, NoiseScale, Sensor, counts, log_likelihood, scores, worths
+from lagjax._fit.model._noise import (
+    AbstractNoise,
+    NoiseScale,
+    Sensor,
+    likelihood_slopes,
+    log_likelihood,
+    sample_counts,
+    sample_worths,
+)
 from lagjax._fit.model._parameters import Parameters, Unknowns
 from lagjax._fit.model._pieces import Piece, Samples, batch_pieces, whole_pieces
 from lagjax._fit.model._records import Guess, start_pair
@@ -82,7 +90,7 @@ _PLAINLY = 9.0
 
 
 class LostMotion(ValueError):
-    """A motion of a trial that could not be followed: of which record, from when, and what became of it."""
+    """Error: a motion of a trial failed; it names the record, the time, and the cause."""
 
 
 class _SystemTrial(NamedTuple):
@@ -609,9 +617,9 @@ class Residuals:
         return noise.estimate(point.flat(), self.weights, self.least, self.sides)
 
     def factors(self, point: Trial, noise: NoiseScale) -> list[np.ndarray]:
-        """√count/σ of every sample, by which its residual enters the sum of squares."""
+        """√count/σ of every sample: the factor of its residual in the sum of squares."""
         pairs = zip(point.residuals, self.batches, strict=True)
-        return [np.sqrt(counts(noise, r, batch.weights, batch.sides)) / noise.sigma for r, batch in pairs]
+        return [np.sqrt(sample_counts(noise, r, batch.weights, batch.sides)) / noise.sigma for r, batch in pairs]
 
     def log_likelihood(self, point: Trial, noise: NoiseScale) -> float:
         return log_likelihood(noise, point.flat(), self.weights, self.sides)
@@ -627,7 +635,7 @@ class Residuals:
         found, tiny = [], np.finfo(float).tiny
         for batch, r in zip(self.batches, point.residuals, strict=True):
             unit = noise.sigma / np.sqrt(np.where(batch.weights > 0, batch.weights, 1.0))
-            score, curvature = scores(r / unit, batch.sides)
+            score, curvature = likelihood_slopes(r / unit, batch.sides)
             found.append(np.where(curvature > tiny, unit * score / np.maximum(curvature, tiny), 0.0))
         return point._replace(residuals=found)
 
@@ -672,12 +680,12 @@ class Residuals:
         return [batch.values[..., signal] + r[..., signal] for batch, r in pairs]
 
     def worths(self, point: Trial, noise: NoiseScale, signal: int) -> list[np.ndarray]:
-        """The worth of each sample in independent ones, (N, T) of every batch, where the sensor of a signal rounds."""
+        """The number of independent samples that each sample is worth, (N, T) of every batch; 1 without rounding."""
         found = []
         for batch, exact in zip(self.batches, self.exact_values(point, signal), strict=True):
             found.append(np.zeros(exact.shape))
             for own, x, there in zip(found[-1], exact, batch.weights[..., signal] > 0, strict=True):
-                own[there] = worths(x[there], self.sensor.step[signal], float((noise.sigma / self.unit)[signal]))
+                own[there] = sample_worths(x[there], self.sensor.step[signal], float((noise.sigma / self.unit)[signal]))
         return found
 
     def count_runs_once(self, point: Trial, noise: NoiseScale) -> "Residuals":
@@ -720,7 +728,8 @@ class Residuals:
         return next(part for part in self.parts if record < part.frame.records.stop)
 
     @property
-    def firsts(self) -> list[int]:
+    def first_pieces(self) -> list[int]:
+        """The index of the first piece of every record."""
         places = {piece.record: k for k, piece in reversed(list(enumerate(self.pieces)))}
         return [places[k] for k in range(len(self.records))]
 

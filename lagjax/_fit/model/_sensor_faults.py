@@ -36,7 +36,7 @@ def require_measurements(records: list[Record], names: tuple[str, ...], periods:
 
 
 def _find_placeholder(column: np.ndarray, period: float) -> tuple[float, int] | None:
-    """The value that stands for missing samples of a signal (T,), and how many; None where there is no such."""
+    """The value that stands for missing samples of a signal (T,), and their number; None if there is none."""
     kinds, counts = np.unique(column, return_counts=True)
     if len(kinds) < _FEWEST:
         return None

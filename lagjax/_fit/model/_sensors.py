@@ -15,11 +15,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._fit.model._noise import find_step
 from lagjax._fit.model._records import Record, restore_structure, spread_over_signals
 
-PyTree = Any
 _CLEAR = 0.35  # of a period between neighbours: at a half the way round is ambiguous; noise takes the rest
 _UNCLEAR = 0.05  # share of steps that may be longer, over gaps and glitches: states are read well where most are not
 _SHARP = 3.0  # times the steps beside it that a jump is large: a tent of noise is 2, and a period of 6 samples is 5
@@ -159,7 +159,7 @@ def require_no_jumps(record: Record, called: str, names: tuple[str, ...], positi
     """Raise `ValueError` where a signal of a record jumps by a period; `positions` of a scene cannot jump at all."""
     for name, column in zip(names, record.matrix.T, strict=True):
         there = np.flatnonzero(np.isfinite(column))
-        jump = _jump(column[there], positions)
+        jump = _find_period_jump(column[there], positions)
         if jump is not None:
             place, period = jump
             raise ValueError(
@@ -170,7 +170,7 @@ def require_no_jumps(record: Record, called: str, names: tuple[str, ...], positi
             )
 
 
-def _jump(y: np.ndarray, positions: bool) -> tuple[int, str] | None:
+def _find_period_jump(y: np.ndarray, positions: bool) -> tuple[int, str] | None:
     """The sample before a jump by a period, and that period in words; None where there is none."""
     steps = np.abs(np.diff(y))
     if len(steps) < 8:

@@ -14,7 +14,7 @@ jump where a delay passes a sample.
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,8 +26,6 @@ from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import Record, restore_structure
 from lagjax._fit.model._sensors import Delayed, sensors, wrap_residuals
 from lagjax._interface import Layout, accept, halves
-
-PyTree = Any
 
 
 class Delay(NamedTuple):

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._fit.model._records import Guess, MeasuredSignal, Record, real_numbers, require_start
 from lagjax._interface import Layout, halves
@@ -23,7 +24,6 @@ from lagjax._run import crossings, sections_of, simulate
 from lagjax._run.hybrid import Hybrid, Scene, Transition
 from lagjax._scene import System
 
-PyTree = Any
 _BUDGET = 10_000_000  # steps: observations last for thousands of periods
 _PATIENCE = 2.0  # mean times between crossings that are waited for behind the last one: a trial may come later
 
@@ -289,7 +289,7 @@ def _impacts_in(system: System, layout: Layout, params: PyTree, timings: Timings
     """A contact is struck where it gives an impulse. Raises `ValueError` for a name that no contact has."""
     flat, (_, struck) = timings.flat, _sections(timings.section)
     names = system.contact_names(layout, params)
-    short = list(map(_shorten, names))
+    short = list(map(_short_contact_name, names))
     for name in struck:
         if name not in (*short, *names):
             raise ValueError(f"Timings names the contact {name!r}, and the contacts are {', '.join(map(repr, short))}.")
@@ -319,12 +319,12 @@ def _crossings_in(system: System, layout: Layout, params: PyTree, timings: Timin
 
     advice = ""
     if system.touches:
-        name = _shorten(system.contact_names(layout, params)[0])
+        name = _short_contact_name(system.contact_names(layout, params)[0])
         advice = f" An impact that closes a gap is no crossing: Timings({name!r}, times, …) are those of a contact."
     return instants, lambda m: "crossings" + ("" if keys is None else f" of section[{keys[flat.which[m]]!r}]"), advice
 
 
-def _shorten(name: str) -> str:
+def _short_contact_name(name: str) -> str:
     """A contact's name without its role: floor of contacts['floor']."""
     return re.sub(r"^\w+\['(.*?)'\]", r"\1", name)
 

@@ -23,7 +23,6 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import helmert
 
-PyTree = Any
 _STRAIGHT = 1e-10  # of the largest roughness: below it a function is not rough but by rounding
 
 
@@ -496,7 +495,7 @@ class Smooth(AbstractTransform):
         return x - spread, x + spread
 
     def draw(self, u, rng):
-        """The same u: there is one least for a smoothness."""
+        """The same u: at given smoothness there is one minimum."""
         return u
 
     def log_volume(self, u, xp: Any = np):

@@ -66,7 +66,7 @@ def comparison(fits: dict[str, Any], folds: int) -> Comparison:
         left, scores = zip(*found, strict=True)
         simplest = _fit_label(names[best := choose_simplest(free, np.array(scores))])
         said.append(f"Left out in {folds} groups, no record is followed better than by {simplest} fit, but for chance.")
-    rows = [*_table(names, free, logs, aic, bic, left), *said]
+    rows = [*_comparison_table(names, free, logs, aic, bic, left), *said]
     return Comparison(names, free, logs, aic, bic, left, names[best], "\n".join(rows))
 
 
@@ -87,7 +87,7 @@ def _fit_label(name: str) -> str:
     return name if name in ("this", "the other") else f"the {name!r}"
 
 
-def _table(names, free, logs, aic, bic, left) -> list[str]:
+def _comparison_table(names, free, logs, aic, bic, left) -> list[str]:
     width = max(len(name) for name in (*names, "fit"))
     heads = f"{'fit':<{width}}{'free':>6}{'log likelihood':>18}{'AIC':>14}{'BIC':>14}"
     rows = [heads if left is None else f"{heads}   RMS left out: {', '.join(left[0])}"]

@@ -14,12 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._equations import decide
+from lagjax._equations import truncated_svd
 from lagjax._fit.result._information import Information
 
 
 class Experiments(NamedTuple):
-    """Planned records in the order of what they would tell. Print it for a table.
+    """Planned records ranked by their expected information. Print it for a table.
 
     - `names` (E,); `gain` (E,): log det(M + GᵀG) − log det M of what is seen already.
     - `newly_seen` (E,): how many combinations a record would see that were not seen.
@@ -49,7 +49,7 @@ def rank_experiments(
 ) -> Experiments:
     """The information of planned records; their rows (M, F) have starts eliminated and are in units of the noise."""
     unseen = known.null
-    basis = decide(unseen.T).null if unseen.size else np.eye(len(labels))
+    basis = truncated_svd(unseen.T).null if unseen.size else np.eye(len(labels))
     have = np.linalg.inv(basis.T @ known.identifiable @ basis)
     gains = [_gain(g, basis, unseen, have) for g in rows]
     order = sorted(range(len(rows)), key=lambda k: (-gains[k][1], -gains[k][0]))
@@ -64,7 +64,7 @@ def _gain(g: np.ndarray, basis: np.ndarray, unseen: np.ndarray, have: np.ndarray
     new = 0
     if unseen.size:
         size = float(np.linalg.norm(g)) or 1.0
-        new = int(decide(g @ unseen, absolute=1e-6 * size * float(np.linalg.norm(unseen, 2))).rank)
+        new = int(truncated_svd(g @ unseen, absolute=1e-6 * size * float(np.linalg.norm(unseen, 2))).rank)
     before, after = (np.diag(basis @ np.linalg.inv(m) @ basis.T) for m in (have, have + seen.T @ seen))
     lost = np.linalg.norm(unseen, axis=1) > 1e-6 if unseen.size else np.zeros(len(before), bool)
     with np.errstate(invalid="ignore", divide="ignore"):

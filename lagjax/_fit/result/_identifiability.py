@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.special import chdtri
 
-from lagjax._equations import decide, echelon_form
+from lagjax._equations import echelon_form, truncated_svd
 from lagjax._fit.model._inputs import input_functions
 from lagjax._fit.model._noise import AbstractNoise, StudentT
 from lagjax._fit.model._parameters import Parameters
@@ -45,7 +45,7 @@ def unseen_sentences(descent: Descent, known: Information) -> tuple[str, ...]:
         there = null_space(triangles, residuals.states, residuals.unknowns, parameters.prior_weights)[0]
         there = confirmed_null(residuals, other, there)
         spaces.append((parameters.jacobian(near) @ there, parameters.values(near)))
-    blocks, elements = _blocks(spaces[0][0]), np.array(parameters.elements)
+    blocks, elements = _independent_blocks(spaces[0][0]), np.array(parameters.elements)
     alone = [int(block[0]) for block in blocks if len(block) == 1]
     nowhere = {name for name in elements[alone] if np.isin(np.flatnonzero(elements == name), alone).all()}
     nowhere -= {*parameters.names}  # those that all share
@@ -118,8 +118,8 @@ def sentence_on_rest(descent: Descent, known: Information, law: AbstractNoise) -
     )
 
 
-def _blocks(null: np.ndarray) -> list[np.ndarray]:
-    """The parameters of the null directions in sets, of which each is free by itself: rows that are not zero."""
+def _independent_blocks(null: np.ndarray) -> list[np.ndarray]:
+    """Sets of parameters between which no null direction (F, K) is shared: indices of nonzero rows, set by set."""
     reduced = np.abs(echelon_form(null.T))
     moved = (reduced > 1e-5 * reduced.max(axis=1, keepdims=True)).astype(int)
     _, component = connected_components(moved.T @ moved)
@@ -136,9 +136,9 @@ def _sentence(parameters: Parameters, block: np.ndarray, spaces) -> str:
     if all(np.all(x[block] != 0) for _, x in spaces) and (rows := _whole_numbers(relative)) is not None:
         if relative[0].shape[1] == 1 and np.ptp(relative[0]) < _EXACT * np.abs(relative[0]).max():
             return f"A common factor of {_join_names(names)} is not seen, only their ratios: keep one of them fixed."
-        return _sentence_on_seen(names, [_product(row, names) for row in rows])
+        return _sentence_on_seen(names, [_write_product(row, names) for row in rows])
     if (rows := _whole_numbers(absolute)) is not None:
-        return _sentence_on_seen(names, [_sum(row, names) for row in rows])
+        return _sentence_on_seen(names, [_write_sum(row, names) for row in rows])
     if (count := absolute[0].shape[1]) > 1:
         return f"{count} combinations of {_join_names(names)} are not seen: keep {count} of them fixed."
     changes = absolute[0][:, 0] / np.abs(absolute[0][:, 0]).max()
@@ -153,7 +153,7 @@ def _directions_within(directions: np.ndarray, block: np.ndarray) -> np.ndarray:
     if not outside.size:
         return directions[block]
     size = np.linalg.norm(directions, axis=0)
-    return (directions / size @ decide(outside / size, absolute=1e-5).null)[block]
+    return (directions / size @ truncated_svd(outside / size, absolute=1e-5).null)[block]
 
 
 def _whole_numbers(spaces: list[np.ndarray]) -> list[list[int]] | None:
@@ -161,7 +161,7 @@ def _whole_numbers(spaces: list[np.ndarray]) -> list[list[int]] | None:
     first = spaces[0]
     if len(spaces) < 2 or any(space.shape != first.shape or not space.size for space in spaces):
         return None
-    orthogonal = decide(first.T, 1e-6).null
+    orthogonal = truncated_svd(first.T, 1e-6).null
     if not orthogonal.size:
         return None
     rows = []
@@ -202,13 +202,13 @@ def _simplify_rows(rows: list[list[int]]) -> list[list[int]]:
         rows[i] = new
 
 
-def _product(row: list[int], names: list[str]) -> str:
+def _write_product(row: list[int], names: list[str]) -> str:
     powers = [(x, name if abs(x) == 1 else f"{name}^{abs(x)}") for name, x in zip(names, row, strict=True)]
     above, below = [text for x, text in powers if x > 0], [text for x, text in powers if x < 0]
     return "·".join(above) + (f"/({'·'.join(below)})" if len(below) > 1 else f"/{below[0]}" if below else "")
 
 
-def _sum(row: list[int], names: list[str]) -> str:
+def _write_sum(row: list[int], names: list[str]) -> str:
     parts = [(x, name if abs(x) == 1 else f"{abs(x)} {name}") for x, name in zip(row, names, strict=True) if x]
     return "".join(f" {'+' if x > 0 else '−'} {part}" for x, part in parts).removeprefix(" + ")
 

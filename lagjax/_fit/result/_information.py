@@ -23,9 +23,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import stdtrit
 
-from lagjax._equations import decide
+from lagjax._equations import truncated_svd
 from lagjax._fit.model._autocorrelation import autocorrelations, close_gaps, correlated_square, lag_products
-from lagjax._fit.model._noise import NoiseScale, harmonics, rounding_square
+from lagjax._fit.model._noise import NoiseScale, rounding_harmonics, rounding_square
 from lagjax._fit.model._parameters import Unknowns
 from lagjax._fit.model._residuals import Residuals, Trial, compress_rows
 from lagjax._fit.search._descent import Descent
@@ -72,18 +72,18 @@ class Information(NamedTuple):
 
     @property
     def identifiable(self) -> np.ndarray:
-        """The covariance (F, F) of what is seen, zero along what is not; with white residuals where some is not."""
+        """The covariance (F, F) of u along directions that data determine, zero along others."""
         return self.lost * self.white if self.null.size else self.covariance
 
     def select(self, places: np.ndarray) -> "Information":
-        """The information about the unknowns at `places`, F for none, without what the others would do."""
+        """The information about the unknowns at `places` (F for none) alone."""
         pair = np.ix_(places, places)
         covariance, white = (np.pad(x, (0, 1))[pair] for x in (self.covariance, self.white))
         null, confirmed = (np.pad(x, ((0, 1), (0, 0)))[places] for x in (self.null, self.confirmed))
         return self._replace(covariance=covariance, white=white, null=null, confirmed=confirmed)
 
     def quantile(self, level: float) -> float:
-        """Student's t of a level, for the effective number of samples less that of parameters."""
+        """Student's t quantile of a level; degrees of freedom: effective samples minus parameters."""
         require_level(level)
         dof = max(float(self.effective.sum()) - len(self.covariance), 1.0)
         return float(stdtrit(dof, 0.5 + 0.5 * level))
@@ -142,7 +142,7 @@ def _noisy_square(residuals: Residuals, trial: Trial, noise: NoiseScale, rows_of
             middle += columns.add(correlated_square(close_gaps(own[:, :, s], batch.weights[..., s] > 0), laws[s].lags))
     for s in np.flatnonzero(np.isfinite(residuals.sensor.step)).tolist():
         sigma, step = noise.sigma[s] / residuals.unit[s], residuals.sensor.step[s]
-        _, rest, before = harmonics(step, sigma)
+        _, rest, before = rounding_harmonics(step, sigma)
         rows = [np.sqrt(b.weights[..., s, None]) / noise.sigma[s] * own[:, :, s]
                 for b, own in zip(residuals.batches, rows_of, strict=True)]  # fmt: skip
         for g, b in zip(rows, residuals.batches, strict=True):
@@ -165,7 +165,7 @@ def _fitted_products(residuals: Residuals, triangles, weighted: list, rows_of: l
         values, vectors = np.linalg.eigh(np.pad(half, (0, 1))[columns[:, :, None], columns[:, None]])
         found = [own @ (vectors * np.sqrt(np.maximum(values, 0.0))[:, None])[:, None]]
         if states:
-            decided = decide(triangles[residuals.leads[batch.rows], :states, :states], _UNFELT)
+            decided = truncated_svd(triangles[residuals.leads[batch.rows], :states, :states], _UNFELT)
             kept = np.arange(states) < decided.rank[:, None]
             inverse = np.where(kept, 1.0 / np.where(kept, decided.values, 1.0), 0.0)
             found.append(raw[..., :states] @ (decided.right * inverse[:, None])[:, None])
@@ -195,7 +195,7 @@ def null_space(
     if not len(unit) or _is_regular(rows / unit):
         return np.zeros((len(unit), 0)), np.diag(1.0 / unit)
     # From above zero by its own round-off, so that a column which is noise alone counts as nothing.
-    decided = decide(rows / unit, NULL, NULL)
+    decided = truncated_svd(rows / unit, NULL, NULL)
     null = decided.null / unit[:, None]
     return null / _norm(null, 0), decided.right[:, : int(decided.rank)] / unit[:, None]
 
@@ -265,7 +265,7 @@ def eliminate_starts(triangles: np.ndarray, slopes: np.ndarray, states: int) -> 
     of_starts, of_u = triangles[..., :states], triangles[..., states:-1]
     if not of_starts.any():
         return slopes[..., states:]
-    instead = decide(of_starts[:, None], _UNFELT).least_norm(of_u.swapaxes(1, 2)).swapaxes(1, 2)
+    instead = truncated_svd(of_starts[:, None], _UNFELT).least_norm(of_u.swapaxes(1, 2)).swapaxes(1, 2)
     shape = (len(slopes), *[1] * (slopes.ndim - 3), *instead.shape[1:])
     return slopes[..., states:] - np.matmul(slopes[..., :states], instead.reshape(shape))
 
@@ -274,7 +274,7 @@ def covariance_of_one_start(rows: np.ndarray, states: int, known: Information) -
     """The covariance (K, K) of the first `states` columns for fixed others, and how they follow these, from weighted
     rows (T, S, K + L) of samples that count for what they are worth."""
     flat = rows.reshape(-1, rows.shape[-1])
-    decided = decide(flat[:, :states], _UNFELT)
+    decided = truncated_svd(flat[:, :states], _UNFELT)
     half = decided.right[:, : int(decided.rank)] / decided.values[: int(decided.rank)]
     return known.lost * half @ half.T, decided.least_norm(flat[:, states:].T).T
 

@@ -5,10 +5,11 @@ to the record itself is that for fixed parameters and the way in which it follow
 """
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 from scipy.special import ndtri, stdtrit
 
 from lagjax._equations import has_constraints
@@ -36,8 +37,6 @@ from lagjax._fit.search._descent import minimise
 from lagjax._fit.search._reader import build_reader, read_start
 from lagjax._run import Trajectory, simulate
 from lagjax._run.hybrid import first_law
-
-PyTree = Any
 
 
 class Prediction(NamedTuple):

@@ -109,7 +109,7 @@ def profile(fit, name: str, level: float) -> Profile:
     line, row = _ProfileLine(fit, parameters.unknown(name)), parameters.row(name)
     threshold = fit.information.quantile(level) ** 2
     ends = [_find_end(line, side, threshold, parameters.room[line.which]) for side in (-1.0, 1.0)]
-    minima = _minima(line, threshold)
+    minima = _find_minima(line, threshold)
 
     def value(at: float) -> float:
         if np.isinf(at):
@@ -160,7 +160,7 @@ def _locate_root(line: _ProfileLine, below: float, above: float, threshold: floa
     return below
 
 
-def _minima(line: _ProfileLine, threshold: float) -> list[tuple[float, float]]:
+def _find_minima(line: _ProfileLine, threshold: float) -> list[tuple[float, float]]:
     """Minima of the profile: the fit's own, and those that searches find from where it falls again."""
     own, places = line.places[0], sorted(line.places, key=lambda place: place.at)
     sides = [places[places.index(own) :: -1], places[places.index(own) :]]

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import PyTree
 
 from lagjax._fit.model._density import Density
 from lagjax._fit.model._noise import AbstractNoise, NoiseScale
@@ -30,9 +31,7 @@ from lagjax._fit.search._descent import Descent
 from lagjax._fit.search._multistart import Waterfall
 from lagjax._fit.search._unexplained import Unexplained, measure_unexplained
 from lagjax._primitives import with_doubles
-from lagjax._show import cell, import_package
-
-PyTree = Any
+from lagjax._show import html_cell, import_package
 
 
 class Covariance(NamedTuple):
@@ -120,7 +119,7 @@ class Fit:
         starts = 1 if waterfall is None else len(waterfall.misfits)
         ok, message = verdict(descent, unseen, known, left, law, starts)
         ok = ok and not (selection and selection.alike)
-        starts = [residuals.restore_state(k, trial.starts[row]) for k, row in enumerate(residuals.firsts)]
+        starts = [residuals.restore_state(k, trial.starts[row]) for k, row in enumerate(residuals.first_pieces)]
         matrices, measured = _record_residuals(residuals, trial), residuals.weights > 0
         samples, squares = measured.sum(axis=0), (trial.flat() ** 2).sum(axis=0, where=measured)
         columns = noise.sigma, noise.dof, samples, known.effective, 2 * (1 - known.correlation)
@@ -144,7 +143,7 @@ class Fit:
     @with_doubles
     def _repr_html_(self) -> str | None:
         """The lab book, and data over fit of the first record, for notebooks; None where nothing can be drawn."""
-        return cell(repr(self), self._draw_first, (5.2, 2.8))
+        return html_cell(repr(self), self._draw_first, (5.2, 2.8))
 
     def _draw_first(self, figure) -> None:
         parts = self.residual_function.parts

@@ -32,7 +32,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._equations import decide
+from lagjax._equations import truncated_svd
 from lagjax._fit.model._law_parameters import FoundLaw
 from lagjax._fit.model._noise import AbstractNoise
 from lagjax._fit.model._parameters import Parameters
@@ -89,7 +89,7 @@ def select_terms(
 ) -> tuple[Descent, Selection]:
     """The fit with the terms that evidence asks for, from that with all of them; `tell` prints a line for each fit."""
     search = _PathSearch.from_fit(done, law, _label_terms(laws), tell or (lambda _: None))
-    search.follow()
+    search.shrink()
     best, why = search.choose()
     best, rivals = search.exchange(best)
     kept = frozenset(best.columns)
@@ -105,7 +105,7 @@ def select_terms(
     end = end._replace(trials=done.trials + search.trials, message=" ".join([end.message, said, *alike]))
     unused = [f"Nothing that was measured depends on {name!r}." for name, same in search.same.items() if not same]
     unused += [f"Only terms that are not kept depend on {label}, which stays at its guess." for label in idle]
-    text = "\n".join([*search.rows(), said, *alike, *unused])
+    text = "\n".join([*search.table_lines(), said, *alike, *unused])
     return end, Selection(kept, tuple(search.steps), tuple(alike), tuple(idle), text)
 
 
@@ -129,7 +129,7 @@ def _alike_sentence(others, kept) -> str:
     return f"The data cannot tell {a} from {b}: either fits."
 
 
-def _nested(a: "_TermFit", b: "_TermFit") -> bool:
+def _are_nested(a: "_TermFit", b: "_TermFit") -> bool:
     """True if one of two fits has all terms of the other."""
     return a.columns.keys() <= b.columns.keys() or b.columns.keys() <= a.columns.keys()
 
@@ -137,7 +137,7 @@ def _nested(a: "_TermFit", b: "_TermFit") -> bool:
 def _project(columns: np.ndarray, target: np.ndarray) -> np.ndarray:
     """The part of a vector (M,) that lies in the span of some columns (M, K), whatever the units of each."""
     norms = np.linalg.norm(columns, axis=0)
-    decided = decide(columns / np.where(norms > 0.0, norms, 1.0), _ALONE**2)
+    decided = truncated_svd(columns / np.where(norms > 0.0, norms, 1.0), _ALONE**2)
     basis = decided.left[:, : int(decided.rank)]
     return basis @ (basis.T @ target)
 
@@ -236,7 +236,7 @@ class _TermFit(NamedTuple):
         null = null / np.linalg.norm(null, axis=0)
         while alive:
             others = np.setdiff1d(np.arange(len(null)), self.places(alive))
-            inside = null @ decide(null[others], absolute=_ALONE).null
+            inside = null @ truncated_svd(null[others], absolute=_ALONE).null
             if not inside.shape[1]:
                 break
             sizes = {name: np.abs(inside[self.columns[name], 0]).max() for name in alive}
@@ -330,9 +330,13 @@ class _PathSearch:
         free = len(fit.done.trial.u) - fit.known.null.shape[1] - dropped
         return free * float(np.log(self.count)) - self.worth * (2 * fit.log_likelihood - loss)
 
-    def follow(self) -> None:
-        """Fits with fewer and fewer terms, as long as a smaller one may be better than the best."""
-        if not self._leap() and self.same and (smaller := self.drop(self.path[0], list(self.same))) is not None:
+    def shrink(self) -> None:
+        """Append fits with ever fewer terms, as long as a smaller one may be better than the best."""
+        if (
+            not self._try_best_subset()
+            and self.same
+            and (smaller := self.drop(self.path[0], list(self.same))) is not None
+        ):
             self.append(smaller, list(self.same))
         while self.path[-1].columns:
             last = self.path[-1]
@@ -344,7 +348,7 @@ class _PathSearch:
             if -2 * self.worth * smaller.log_likelihood > min(step.bic for step in self.steps):
                 break
 
-    def _leap(self) -> bool:
+    def _try_best_subset(self) -> bool:
         """Append the fit with the terms that explain the most, as many as the linear model of the first fit asks for;
         True where it is better than that."""
         first = self.path[0]
@@ -361,7 +365,7 @@ class _PathSearch:
         return True
 
     def choose(self) -> tuple[_TermFit, str]:
-        """The fit that is taken, and what it was chosen by."""
+        """The chosen fit, and the name of the criterion that chose it."""
         best = self.path[int(np.argmin([step.bic for step in self.steps]))]
         enough = len(best.done.residuals.records) >= _FEWEST_RECORDS and len(self.path) > 1
         self.by_records = bool(enough and np.nanmax(best.known.correlation) > _CORRELATED)
@@ -398,7 +402,9 @@ class _PathSearch:
             behind = [self._measure_lag(one, best) for one in rivals]
             if not rivals or min(lag + least for lag, _, least in behind) > 0:
                 near = [one for one, (lag, most, _) in zip(rivals, behind, strict=True) if lag < most]
-                return best, [one for one in near if len(one.columns) <= len(best.columns) and not _nested(one, best)]
+                return best, [
+                    one for one in near if len(one.columns) <= len(best.columns) and not _are_nested(one, best)
+                ]
             lost, first = best.columns, rivals[int(np.argmin([lag + least for lag, _, least in behind]))]
             best, dropped = first, tuple(name for name in lost if name not in first.columns)
             left_out = float(np.exp(np.mean(self.score(best)))) if self.by_records else None
@@ -431,8 +437,8 @@ class _PathSearch:
                 likely.append((bic, wider, rest))
         return sorted(likely, key=lambda one: one[0])
 
-    def rows(self) -> list[str]:
-        """The lines of the table: a step each, with the terms that left, and what is left."""
+    def table_lines(self) -> list[str]:
+        """The printed table: for each step the terms dropped, the BIC, and the residuals."""
         heads = ["without", "BIC", "RMS left out", "terms"]
         rows = [
             [_list_names(step.dropped), f"{step.bic:.1f}", f"{step.left_out:.4g}" if step.left_out else "",

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._equations import decide
+from lagjax._equations import truncated_svd
 from lagjax._fit.model._noise import AbstractNoise
 from lagjax._fit.model._parameters import stack_rows
 from lagjax._fit.model._records import Record
@@ -32,7 +32,7 @@ from lagjax._fit.result._evidence import describe_sizes
 from lagjax._fit.result._information import Information, eliminate_starts, information
 from lagjax._fit.search._descent import Descent, column_norms, eliminate
 from lagjax._fit.search._unexplained import MOST_NAMED, Unexplained, measure_unexplained, unexplained_motion
-from lagjax._run.hybrid import jumps
+from lagjax._run.hybrid import may_jump
 
 _BEYOND = 2.0  # standard errors that a step must lead beyond a bound: of sound fits at a bound one in forty does
 _CORRELATED = 0.5
@@ -49,8 +49,8 @@ def verdict(
 ) -> tuple[bool, str]:
     """Judge if a fit can be relied upon, and say why; `left` is what the best of `starts` searches left."""
     residuals, parts = descent.residuals, [descent.message]
-    strikes = any(jumps(part.scene) for part in residuals.parts)
-    more, astray = max(64, 4 * starts), strikes and _leaves_motion(known, left)
+    strikes = any(may_jump(part.scene) for part in residuals.parts)
+    more, astray = max(64, 4 * starts), strikes and _has_motion_left(known, left)
     if known.confirmed.shape[1] and strikes:
         text = f"Take starts={more}; else fix it, or measure more."
         parts.append(
@@ -93,10 +93,10 @@ def is_doubtful(descent: Descent) -> bool:
     """True where slowly changing residuals show motion that is left, or nothing depends on a parameter: where motion
     sticks or strikes, another start may then end elsewhere."""
     known = information(descent)
-    return bool(known.null.shape[1]) or _leaves_motion(known, measure_unexplained(descent))
+    return bool(known.null.shape[1]) or _has_motion_left(known, measure_unexplained(descent))
 
 
-def _leaves_motion(known: Information, left: Unexplained) -> bool:
+def _has_motion_left(known: Information, left: Unexplained) -> bool:
     return left.doubted and bool(np.nanmax(known.correlation) > _CORRELATED)
 
 
@@ -127,7 +127,7 @@ def _describe_bends(descent: Descent, known: Information) -> list[str]:
     """Sentences for numbers that all records share, where the likelihood falls on one side by less than half of what an
     interval says."""
     residuals, trial, found = descent.residuals, descent.trial, []
-    if known.null.shape[1] or not any(jumps(part.scene) for part in residuals.parts):
+    if known.null.shape[1] or not any(may_jump(part.scene) for part in residuals.parts):
         return found
     parameters, best = residuals.parameters, residuals.log_likelihood(trial, descent.noise)
     labels, deviations = parameters.labels, _deviations(known)
@@ -267,7 +267,7 @@ def shifts_without(states: int, triangles, records: np.ndarray, variances, white
     size, growth = 1.0 / np.sqrt(white), np.sqrt(np.maximum(variances / white, 1.0))
     held = np.pad(np.diag(prior), ((0, 0), (0, 1)))
     whole = compress_rows(np.concatenate([own.reshape(-1, own.shape[-1]), held])[None])[0][:-1, :-1] / size
-    if decide(whole, _SEEN).rank < whole.shape[1]:
+    if truncated_svd(whole, _SEEN).rank < whole.shape[1]:
         return Shifts(np.zeros(0, int), np.zeros((0, len(white))), np.zeros(0))
     names, which = np.unique(records, return_inverse=True)
     mine = compress_rows(stack_rows(own, which))

@@ -47,7 +47,7 @@ _KINK = (
 
 
 class Descent(NamedTuple):
-    """The end of a search: its last trial with the noise, how many there were, and a sentence."""
+    """The end of a search: the last trial with its noise, the number of trials, and a sentence."""
 
     residuals: Residuals
     trial: Trial
@@ -66,16 +66,16 @@ class DescentStep(NamedTuple):
 
 
 class Anchor(NamedTuple):
-    """Σ (weight · (u − centre))²/2 beside half the sum of squares: what data say little about stays where it was."""
+    """A penalty Σ (weight · (u − centre))²/2: unknowns on which the data say little stay at the `centre`."""
 
     centre: np.ndarray
     weight: np.ndarray
 
-    def pull(self, u: np.ndarray) -> np.ndarray:
+    def weighted_residuals(self, u: np.ndarray) -> np.ndarray:
         return self.weight * (u - self.centre)
 
     def add_prior(self, weight: np.ndarray) -> "Anchor":
-        """The same with the sum of a prior density about zero, Σ (weight · u)²/2, but for a constant."""
+        """The anchor that includes a normal prior Σ (weight · u)²/2; the constant is dropped."""
         both = np.hypot(self.weight, weight)
         return Anchor(self.centre * (self.weight / np.where(both > 0, both, 1.0)) ** 2, both)
 
@@ -97,7 +97,7 @@ class _Model:
         return compress_rows(triangles.reshape(1, -1, triangles.shape[-1])), unknowns.select([0])  # no piece's own
 
     def cost_of(self, trial: Trial) -> float:
-        pulled = 0.5 * float(np.sum(self.anchor.pull(trial.u) ** 2))
+        pulled = 0.5 * float(np.sum(self.anchor.weighted_residuals(trial.u) ** 2))
         return self.residuals.cost(trial, self.factors, self.noise) + pulled
 
     def evaluate(self, point: Point) -> tuple[Trial, float]:
@@ -106,10 +106,10 @@ class _Model:
         fall = self.cost - self.cost_of(trial)
         return self.residuals.evaluate(point, begun=trial) if fall > 0.0 else trial, fall
 
-    def step(self, damping: float, limits: tuple[np.ndarray, np.ndarray] | None = None) -> DescentStep:
+    def solve_step(self, damping: float, limits: tuple[np.ndarray, np.ndarray] | None = None) -> DescentStep:
         u, states, unknowns = self.trial.u, self.residuals.states, self.unknowns
         limits = self.residuals.parameters.limits(u) if limits is None else limits
-        pull = self.anchor.weight, self.anchor.pull(u)
+        pull = self.anchor.weight, self.anchor.weighted_residuals(u)
         scale = column_norms(self.triangles, states, unknowns)
         return eliminate(self.triangles, states, scale, damping, pull, unknowns, limits)
 
@@ -144,14 +144,14 @@ class _Model:
         u = self.residuals.parameters.take_step(self.trial.u, part * step.u)
         return Point(u, self.trial.starts + part * step.starts)
 
-    def leap(self, enough: float) -> tuple[float, Trial | None]:
+    def try_long_step(self, enough: float) -> tuple[float, Trial | None]:
         """The gain that a step promises which may end anywhere in the sets of numbers, and a better trial on its way.
 
         Next to a bound, where a positive number is too small by many orders, u has no slope, and no step within reach
         has any gain.
         """
         residuals = self.residuals
-        step = self.step(_LEAST_DAMPING, residuals.parameters.leaps(self.trial.u))
+        step = self.solve_step(_LEAST_DAMPING, residuals.parameters.leaps(self.trial.u))
         if not self.is_enough(step.gain, enough):
             for part in (1.0, 0.1, 0.01):
                 with contextlib.suppress(LostMotion):
@@ -201,10 +201,10 @@ def _descend(
     damping, falls, blind, limit = _FIRST, [(trials, np.inf)], None, trials + limit - 1
     while True:
         model = _Model(residuals, trial, law, anchor)
-        gain = model.step(_LEAST_DAMPING).gain
+        gain = model.solve_step(_LEAST_DAMPING).gain
         end = functools.partial(Descent, residuals, trial, model.noise)
         if model.is_enough(gain, enough):
-            gain, farther = model.leap(enough)
+            gain, farther = model.try_long_step(enough)
             if farther is not None and trials < limit:
                 trial, trials = farther, trials + 1
                 continue
@@ -238,7 +238,7 @@ def _find_better_trial(
     growth, at, residuals, blind = 2.0, model.trial, model.residuals, []
     seen = _find_seen(residuals, at)
     while trials < limit:
-        step: DescentStep | None = model.step(damping)
+        step: DescentStep | None = model.solve_step(damping)
         if step.gain <= _FLAT * model.cost or damping > _MOST_DAMPING:
             break
         for straight in (True, False):

@@ -61,10 +61,6 @@ def _search_shortly(residuals: Residuals, u: np.ndarray, starts: np.ndarray) -> 
     return misfit(done.noise, residuals), done.trial.point
 
 
-def _describe_misfit(misfit: float) -> str:
-    return f"{misfit:.3g} of the signals" if np.isfinite(misfit) else "its motion could not be followed"
-
-
 def run_multistart(
     residuals: Residuals,
     search: Callable[[Point], Descent],
@@ -87,7 +83,9 @@ def run_multistart(
     for k, one in enumerate(u):
         trials.append(_search_shortly(short, one, point.starts))
         if tell:
-            tell(f"start {k + 1} of {starts}: {_describe_misfit(trials[-1][0])} after a short search")
+            left = trials[-1][0]
+            text = f"{left:.3g} of the signals" if np.isfinite(left) else "its motion could not be followed"
+            tell(f"start {k + 1} of {starts}: {text} after a short search")
     trials.sort(key=lambda trial: trial[0])
     misfits, done, chosen = np.array([trial[0] for trial in trials]), [], []
     for k in np.flatnonzero(np.isfinite(misfits)).tolist():  # the best of different misfits

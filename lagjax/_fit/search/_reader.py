@@ -36,7 +36,9 @@ class Reader(NamedTuple):
         """A reader with the longest windows that leave at most `_WORSE_WINDOW` times what the shortest leave, at
         `probes` places."""
         places = even_places(len(record), probes)
-        windows, scatter = zip(*(_window(record.ts[places], *signal) for signal in _signals(record)), strict=True)
+        windows, scatter = zip(
+            *(_choose_window(record.ts[places], *signal) for signal in _signal_columns(record)), strict=True
+        )
         return cls(record, windows, scatter, tuple(periods.tolist()))
 
     def states(self, places) -> np.ndarray:
@@ -58,12 +60,12 @@ class Reader(NamedTuple):
         )
 
     def read(self, places) -> list[tuple]:
-        """The result of `_read_states` for every signal at the samples `places`."""
-        ts, pairs = self.record.ts[places], zip(_signals(self.record), self.windows, strict=True)
+        """The result of `_read_states` for every signal, at the samples with indices `places`."""
+        ts, pairs = self.record.ts[places], zip(_signal_columns(self.record), self.windows, strict=True)
         return [_read_states(ts, *signal, window) for signal, window in pairs]
 
 
-def _signals(record: Record) -> list[tuple[np.ndarray, np.ndarray]]:
+def _signal_columns(record: Record) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(record.ts[np.isfinite(column)], column[np.isfinite(column)]) for column in record.matrix.T]
 
 
@@ -75,7 +77,7 @@ def _read_states(ts: np.ndarray, t: np.ndarray, y: np.ndarray, window: int):
     return _local_cubics(ts, t, y, min(window, len(t)))
 
 
-def _window(ts: np.ndarray, t: np.ndarray, y: np.ndarray) -> tuple[int, float]:
+def _choose_window(ts: np.ndarray, t: np.ndarray, y: np.ndarray) -> tuple[int, float]:
     """The number of samples in the window for one signal, and the scatter about the shortest."""
 
     def left(window: int) -> float:

@@ -30,7 +30,7 @@ from lagjax._fit.search._descent import Anchor, Descent, minimise
 from lagjax._fit.search._multistart import misfit
 from lagjax._fit.search._reader import Reader, pad_states, short_windows, start_noise, time_scales
 from lagjax._fit.search._unexplained import measure_unexplained
-from lagjax._run.hybrid import Hybrid, jumps, laws
+from lagjax._run.hybrid import Hybrid, list_laws, may_jump
 from lagjax._show import even_places
 
 # In units of half the sum of squares: the end of a search, where parameters are within 0.05 standard deviations of
@@ -48,7 +48,7 @@ _LYAPUNOV = 5.0  # times 1/λ that a record is long: shorter ones are followed w
 # records from which on it pays.
 _SAMPLED, _SAMPLES_EACH, _PAYS = 64, 30, 4
 _SUSPECT, _SAMPLES_OF_LEVEL = 0.05, 4  # of the signals, left by a search; samples for each unknown in first samples
-# Shortest segments of a record, whose motion jumps, from which on they come before other starts. Of up to 17 other
+# Shortest segments of a record, whose motion may_jump, from which on they come before other starts. Of up to 17 other
 # starts cost less; of 51 to 115 these did not find the motion in a minute and more, and segments did in 13 to 27 CPU s.
 _LONG = 32
 _GRADIENT_STEPS = 3000  # of a descent by gradients
@@ -68,10 +68,11 @@ class Search:
         rough |= bool(residuals.parameters.prior_weights.any())
         self.enough = _ENOUGH_OF_LEVEL * residuals.measured if rough else _ENOUGH
         whole = [
-            isinstance(part.scene, Hybrid) and any(map(has_constraints, laws(part.scene))) for part in residuals.parts
+            isinstance(part.scene, Hybrid) and any(map(has_constraints, list_laws(part.scene)))
+            for part in residuals.parts
         ]
         self.readers = list(readers)
-        self.jumping = np.array([jumps(part.scene) for part in residuals.parts for _ in part.records])
+        self.jumping = np.array([may_jump(part.scene) for part in residuals.parts for _ in part.records])
         for part, is_whole in zip(residuals.parts, whole, strict=True):
             if is_whole:  # the constraints of a mode that is not the first
                 self.readers[part.frame.records] = [None] * len(part.records)
@@ -157,7 +158,9 @@ class Search:
     def _knows_starts(self) -> bool:
         """True where "auto" may begin with the first samples of records: all starts are known, and no motion jumps."""
         residuals = self.residuals
-        plain = not any(jumps(part.scene) or part.clocks or part.signals.delays is not None for part in residuals.parts)
+        plain = not any(
+            may_jump(part.scene) or part.clocks or part.signals.delays is not None for part in residuals.parts
+        )
         return self.method == "auto" and plain and not any(self.readers) and not residuals.fitted.any()
 
     def _search_beginnings(self, point: Point, done: Descent | None) -> Descent | None:
@@ -181,7 +184,7 @@ class Search:
         if joined is not None:
             worse = f"leaves {misfit(joined.noise, joined.residuals) / misfit(done.noise, part):.2g} times more"
         text = f"The records are followed in {len(pieces)} pieces, each with a start of its own: to join them {worse}"
-        if is_chaotic := (growth := _separation(done)) > _LYAPUNOV:
+        if is_chaotic := (growth := _trajectory_separation(done)) > _LYAPUNOV:
             text += f", because motions that begin side by side part e^{growth:.0f}-fold over a record."
         else:
             text += ", though the motion does not forget its start: the scene lacks something that lasts longer."
@@ -250,7 +253,7 @@ class Search:
         short, states, owners = [], [], []
         for part, scale in zip(self.residuals.parts, self._time_scales(u), strict=True):
             last = max((record.ts[-1] for record in part.records), default=0.0)
-            if np.isfinite(scale) and scale > _SHORTEST * abs(last) and not jumps(part.scene):
+            if np.isfinite(scale) and scale > _SHORTEST * abs(last) and not may_jump(part.scene):
                 records, begun, of = short_windows(self._readers_of(part), 0.25 * scale)
                 states.append(pad_states(begun, self.residuals.states))
                 short.append(part.with_records(records, np.ones(len(records), bool)))
@@ -281,7 +284,7 @@ class Search:
         pairs = zip(self.residuals.parts, self._time_scales(u), strict=True)
         scales = [scale for part, scale in pairs for _ in part.records]
         modes = [piece.mode for piece in self.residuals.pieces]
-        return _levels(self.readers, scales, self.jumping, modes)
+        return _growing_cuts(self.readers, scales, self.jumping, modes)
 
     # ---- gradients ----
 
@@ -345,7 +348,7 @@ def _last_followed_level(levels_done: list[Descent]) -> int:
     return good
 
 
-def _separation(done: Descent) -> float:
+def _trajectory_separation(done: Descent) -> float:
     """λ times the length of the longest record; λ is the median over pieces of the growth of derivatives by the start
     between the first and the last third."""
     rates, states = [], done.residuals.states
@@ -365,11 +368,13 @@ def _separation(done: Descent) -> float:
 _FEWEST_IN_SEGMENT, _ASIDE = 8, 3  # samples; the part of a segment by which an edge may move
 
 
-def _levels(readers: list[Reader | None], scales: list[float], jumping: np.ndarray, modes: list) -> list[list[Piece]]:
+def _growing_cuts(
+    readers: list[Reader | None], scales: list[float], jumping: np.ndarray, modes: list
+) -> list[list[Piece]]:
     """Cuts of records from segments of two of their time `scales` to whole records, each twice as long as the one
     before; none where records are hardly longer, and None instead of a reader leaves its record out."""
     reading = [(k, reader) for k, reader in enumerate(readers) if reader is not None]
-    edges = [(k, reader.record, _edges(reader, 2.0 * scales[k], jumping[k])) for k, reader in reading]
+    edges = [(k, reader.record, _segment_edges(reader, 2.0 * scales[k], jumping[k])) for k, reader in reading]
     most, found, stride = max(len(e) - 1 for *_, e in edges), [], 1
     while stride < most:
         pieces = []
@@ -383,7 +388,7 @@ def _levels(readers: list[Reader | None], scales: list[float], jumping: np.ndarr
     return found
 
 
-def _edges(reader: Reader, length: float, jumping: bool) -> np.ndarray:
+def _segment_edges(reader: Reader, length: float, jumping: bool) -> np.ndarray:
     """The first samples of the shortest segments of one record, and its length; where the motion jumps, those near by
     that look smooth."""
     ts = reader.record.ts

@@ -16,4 +16,4 @@ or another cache of the user's own keeps.
 """
 
 from lagjax._interface.reads._edition import Edition
-from lagjax._interface.reads._identity import array_text, hash_of, identity, place_in, source, strip_addresses
+from lagjax._interface.reads._identity import array_text, hash_of, identity, index_of, source_text, strip_addresses

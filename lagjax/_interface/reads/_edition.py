@@ -22,7 +22,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from lagjax._interface.reads._identity import CHANGING, Walk, array_text, place_in
+from lagjax._interface.reads._identity import CHANGING, Walk, array_text, index_of
 from lagjax._interface.reads._marks import LARGEST_ARRAY, LARGEST_CONTAINER, SIZE, Marks
 
 _MOST_THINGS = 2000  # functions, classes and objects of one walk, some 50 ms; what is beyond is known by its identity
@@ -111,7 +111,7 @@ class Edition:
         finally:
             _inside.is_traced = False
             if self._watch is not None:
-                self._watch.settle()
+                self._watch.drop_own_writes()
 
 
 def _pickled_edition(function: Callable) -> Edition:
@@ -158,7 +158,7 @@ class _Watch:
                 return walk, text
             wanted = names
 
-    def settle(self) -> None:
+    def drop_own_writes(self) -> None:
         """After a call: stop watching places that the function itself has written to."""
         latest = self._latest
         if latest is None or latest[0].hold():
@@ -206,7 +206,7 @@ class _LiveWalk(Walk):
 
     def describe_array(self, array: Any) -> str:
         if isinstance(array, Tracer):
-            return f"tracer {place_in(self.tracers, array)}: {array.shape} {array.dtype} {array.weak_type}"
+            return f"tracer {index_of(self.tracers, array)}: {array.shape} {array.dtype} {array.weak_type}"
         if isinstance(array, np.ndarray):
             if self.read(array, None, array) is CHANGING:
                 return CHANGING

@@ -77,7 +77,7 @@ class Walk:
 
     def hold(self, thing: Any) -> str:
         """Add a thing to `held`, to be compared by identity, and return its name."""
-        return f"{type(thing).__qualname__} {place_in(self.held, thing)}"
+        return f"{type(thing).__qualname__} {index_of(self.held, thing)}"
 
     # ---- the walk ----
 
@@ -92,18 +92,18 @@ class Walk:
         """Return a short text for a value; for functions, classes and objects a number that refers to their line."""
         kind = type(value)
         if kind in _ATOMS:
-            return shorten(repr(value))
+            return shorten_text(repr(value))
         if isinstance(value, np.ndarray | np.generic | jax.Array):
             return self.describe_array(value)
         if isinstance(value, enum.Enum):
             return f"{self.name(kind)}.{value.name} = {self.name(value.value, deep + 1)}"
         if isinstance(value, _ATOMS):  # of a class of its own
             base: Any = next(base for base in _ATOMS if isinstance(value, base))
-            return f"{self.name(kind)} {shorten(base.__repr__(value))}"
+            return f"{self.name(kind)} {shorten_text(base.__repr__(value))}"
         if isinstance(value, bytearray | array.array):
             return self.name(type(value)) + self.describe_array(self.read(value, None, np.array(value)))
         if isinstance(value, self.containers) and deep < _DEEP:
-            return shorten(self.container(value, deep + 1))
+            return shorten_text(self.container(value, deep + 1))
         if isinstance(value, types.ModuleType):
             return value.__name__
         if (name := _library_name(value)) is not None:
@@ -218,7 +218,11 @@ class Walk:
             if users:
                 held = {name: x for name, x in held.items() if self.wants(name, x, thing)}
             else:  # not its caches, unless there is nothing else, as in what delegates to another object
-                held = {name: x for name, x in held.items() if not name.startswith("_") or _is_plain_value(x)} or held
+                held = {
+                    name: x
+                    for name, x in held.items()
+                    if not name.startswith("_") or isinstance(x, (int, float, complex, str, np.ndarray, jax.Array))
+                } or held
         held = {name: self.read(inside if name in inside else thing, name, x) for name, x in held.items()}
         if not held and not users:
             return self._describe_opaque(thing)
@@ -238,7 +242,7 @@ class Walk:
         return [("shown", strip_addresses(shown))]
 
 
-def place_in(things: list, thing: Any) -> int:
+def index_of(things: list, thing: Any) -> int:
     """Return the index of this very object in a list; append it if it is not there."""
     for k, other in enumerate(things):
         if other is thing:
@@ -260,10 +264,6 @@ def _is_class_boilerplate(name: str, value: Any) -> bool:
     if is_dunder:
         return isinstance(value, types.FunctionType | property)
     return not isinstance(value, types.MemberDescriptorType | types.GetSetDescriptorType) and name != "_abc_impl"
-
-
-def _is_plain_value(value: Any) -> bool:
-    return isinstance(value, int | float | complex | str | np.ndarray | jax.Array)
 
 
 def _import_module(names: dict[str, Any], level: int, name: str) -> types.ModuleType | None:
@@ -357,7 +357,7 @@ def names_of(code: types.CodeType) -> ReadNames:
 # ---- words -----------------------------------------------------------------------------------------------------------
 
 
-def source(function: Callable) -> str:
+def source_text(function: Callable) -> str:
     """Return the source text of a function, or its name if there is none."""
     while isinstance(function, functools.partial):
         function = function.func
@@ -374,7 +374,7 @@ def array_text(value: Any) -> str:
     except TypeError:  # keys of jax.random
         array = np.asarray(jax.random.key_data(value))
     if array.dtype == object:
-        return strip_addresses(shorten(repr(array.tolist())))
+        return strip_addresses(shorten_text(repr(array.tolist())))
     return f"{array.dtype} {array.tolist()}" if array.size <= 16 else f"{array.dtype}{array.shape} {hash_of(array)}"
 
 
@@ -386,17 +386,14 @@ def strip_addresses(text: str) -> str:
     return re.sub(r"0x[0-9a-f]+", "0x", text)
 
 
-def shorten(text: str) -> str:
+def shorten_text(text: str) -> str:
     return text if len(text) <= _LONG else f"{text[:40]}… {hashlib.sha256(text.encode()).hexdigest()[:16]}"
 
 
 @functools.lru_cache(maxsize=4096)
 def code_text(code: types.CodeType) -> str:
     """Return a hash of what a function does, with its constants and names; independent of its line numbers."""
-    inner = [code_text(x) if isinstance(x, types.CodeType) else _constant_text(x) for x in code.co_consts]
+    shown = [sorted(map(repr, x)) if isinstance(x, frozenset) else x for x in code.co_consts]
+    inner = [code_text(x) if isinstance(x, types.CodeType) else repr(x) for x in shown]
     text = "\n".join([code.co_code.hex(), repr(code.co_names), repr(code.co_varnames), *inner])
     return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def _constant_text(x: Any) -> str:
-    return repr(sorted(map(repr, x))) if isinstance(x, frozenset) else repr(x)

@@ -33,7 +33,7 @@ CACHE_LINE = 8  # doubles
 KINDS = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
 
 
-def job(
+def job_structure(
     name: str, pointers: tuple[str, ...], integers: tuple[str, ...], doubles: tuple[str, ...] = (), *others: str
 ) -> type:
     """The ctypes structure of the arguments shared by all threads, eight bytes per field; `others` are pointers too."""
@@ -46,7 +46,7 @@ def job(
     return type(name, (ctypes.Structure,), {"_fields_": fields})
 
 
-def integers(module: ir.Module, numbers: np.ndarray) -> ir.GlobalVariable:
+def integer_constant(module: ir.Module, numbers: np.ndarray) -> ir.GlobalVariable:
     """A constant array of int64 in the module, stored as bytes, whose text is short and fast to parse."""
     data = bytearray(numbers.tobytes())
     kind = ir.ArrayType(ir.IntType(8), len(data))

@@ -36,7 +36,7 @@ _DIGEST = hashlib.sha256
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 
-def folder() -> Path | None:
+def object_folder() -> Path | None:
     """The folder of kept objects; None if `LAGJAX_CACHE` turns that off."""
     chosen = os.environ.get("LAGJAX_CACHE", "")
     if chosen:
@@ -84,7 +84,7 @@ def _warn_once(place: Path) -> None:
 
 def load_or_make(make: Callable[[], bytes], *made_from: str) -> bytes:
     """The object kept for the texts `made_from`, or, if there is none, `make()`, which is then kept."""
-    chosen = folder()
+    chosen = object_folder()
     place = None if chosen is None else private_folder(chosen)
     if place is None:
         return make()

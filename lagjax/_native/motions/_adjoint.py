@@ -15,7 +15,7 @@ rates of the tangents and the series that are multiplied.
 """
 
 from lagjax._native.code._constants import NEAR_ZERO
-from lagjax._native.code._frame import Frame, Lane, job
+from lagjax._native.code._frame import Frame, Lane, job_structure
 from lagjax._native.code._ir import INTEGER, Code, Value
 from lagjax._native.motions._maps import CauchyProducts, OrderRecursion, ProjectedEnd, SeriesSum, ZerothOrder
 from lagjax._native.motions._recorded_steps import StepReplay
@@ -23,7 +23,7 @@ from lagjax._native.series._cotangents import Cotangents
 from lagjax._native.series._motion_parts import MotionParts
 
 # `y_ct` is the cotangent of the end, and becomes that of the start.
-JOB = job(
+JOB = job_structure(
     "AdjointJob",
     ("next_member", "ts", "params", "record", "first_step", "steps", "path_ct", "y_ct", "params_ct", "excess"),
     ("ts_stride", "params_stride", "members", "times", "order"),
@@ -53,7 +53,7 @@ class Adjoint:
         if parts.projection is not None:
             steps.insert(0, ProjectedEnd(motion, parts).pull(cotangents))
         if (saltation := self.replay.saltation()) is not None:
-            steps = [saltation.pull(cotangents), *steps, saltation.note_after()]
+            steps = [saltation.pull(cotangents), *steps, saltation.store_next_pieces()]
         self._run_function(steps)
         motion.write_begin(self.start_next)
         motion.finish()

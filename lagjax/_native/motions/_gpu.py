@@ -95,7 +95,7 @@ def form_for(entry: Entry, lane: OneLane, order: int) -> GpuForm:
     return GpuForm(order, False) if lane.large or fitting < LEAST_ORDER else GpuForm(min(order, fitting), True)
 
 
-def grid(entry: Entry, members: int) -> tuple[int, int]:
+def grid_size(entry: Entry, members: int) -> tuple[int, int]:
     return min(MOST_BLOCKS[entry], max(1, -(-members // THREADS))), THREADS
 
 

@@ -2,9 +2,9 @@
 
 XLA calls a handler with a frame that has the addresses of arguments, results and one attribute: that of a `Plan`, which
 tells which machine code to run, and for how long. One handler serves all kernels. It does not block: it starts a run,
-does as many rounds as take one time slice, and returns what is needed to resume (`Rest`). The caller checks whether the
-run is complete, and how members ended; all rare cases are handled in Python. Outside of XLA a `Kernel` starts in the
-same way, with one call.
+does as many rounds as take one time slice, and returns what is needed to resume (`UnfinishedRun`). The caller checks
+whether the run is complete, and how members ended; all rare cases are handled in Python. Outside of XLA a `Kernel`
+starts in the same way, with one call.
 
 Layouts of structures are those of `xla/ffi/api/c_api.h`, on 64 bits. `unavailable` compares its version with that of
 the header of the installed XLA.
@@ -59,8 +59,8 @@ class Plan(ctypes.Structure):
     ]
 
 
-class Rest(NamedTuple):
-    """The state of a run that a handler left unfinished: the memory of the thread and its integers.
+class UnfinishedRun(NamedTuple):
+    """The state of a run that stopped after a time slice: the memory of the thread and its integers.
 
     As an array of `size` doubles it has some unused ones, up to the next cache line, then the memory, and at the end
     64-bit integers: those of the lanes, the number of unused doubles, the idle steps of lanes, the next member, and 1
@@ -77,7 +77,7 @@ class Rest(NamedTuple):
         return layout.size + CACHE_LINE + _INTEGERS
 
     @classmethod
-    def from_array(cls, array: np.ndarray, layout: Memory) -> "Rest":
+    def from_array(cls, array: np.ndarray, layout: Memory) -> "UnfinishedRun":
         """A copy of the rest that a handler wrote as an array."""
         integers = array[-_INTEGERS:].view(np.int64).copy()
         lanes, (skipped, *_) = np.split(integers, [-_OTHERS])
@@ -109,7 +109,7 @@ class Handler:
 
     Its arguments are `ts` (1 or N, T), `y0` (N, 2n) and `params` (1 or N, P), its results `path` (N, T, 2n), `y_end`
     (N, 2n), then `t_end`, `code`, `steps` and `rejected`, each (N,), the `changes` of guards (N, G), and the `rest` of
-    the run (`Rest.size`), all of doubles. `path` is NaN at times that a member did not reach.
+    the run (`UnfinishedRun.size`), all of doubles. `path` is NaN at times that a member did not reach.
 
     `begin` does the same for Python: it takes the addresses of a plan, of the arguments and of the results, then N, T
     and the numbers of rows of `ts` and `params`.
@@ -158,8 +158,8 @@ def compile_handler(name: str, arguments: int, results: int, write: Callable, *p
         _write_version_answer(code, extension)
         code.builder.ret(null)
     args, rets, attrs = (load_at(frame, offset, POINTER) for offset in (_ARGS, _RETS, _ATTRS))
-    plan = load_at(load_at(element(attrs, 0), _SCALAR_VALUE, POINTER), 0, POINTER)
-    buffers = [element(args, i) for i in range(arguments)] + [element(rets, i) for i in range(results)]
+    plan = load_at(load_at(take_element(attrs, 0), _SCALAR_VALUE, POINTER), 0, POINTER)
+    buffers = [take_element(args, i) for i in range(arguments)] + [take_element(rets, i) for i in range(results)]
     work(code, plan, *([load_at(buffer, offset, POINTER) for buffer in buffers] for offset in (_DATA, _DIMS)))
     code.builder.ret(null)
     engine, places = compile_module(module, ("handler", *public))
@@ -186,7 +186,7 @@ def load_at(base: Value, offset: int, kind: ir.Type) -> Value:
     return base.code.load(_function_address(base, offset), kind)
 
 
-def element(array: Value, index: int) -> Value:
+def take_element(array: Value, index: int) -> Value:
     return array.code.load(array.code.element(array, index, POINTER), POINTER)
 
 
@@ -219,8 +219,8 @@ class PlanCode:
         """
         code = self.code
         given = job_of(code, job, self.known | fields)
-        call(code, self.known[f"begin{kernel}"], ir.VoidType(), given, *memory[:2])
-        return call(code, self.known[f"run{kernel}"], INTEGER, given, *memory, rounds)
+        call_address(code, self.known[f"begin{kernel}"], ir.VoidType(), given, *memory[:2])
+        return call_address(code, self.known[f"run{kernel}"], INTEGER, given, *memory, rounds)
 
     def skipped(self, address: Value) -> Value:
         """The number of doubles from an address to the next cache line."""
@@ -267,7 +267,7 @@ def job_of(code: Code, kind: type, fields: dict[str, Any]) -> Value:
     return job
 
 
-def call(code: Code, function: Value, result: ir.Type, *arguments: Value) -> Value:
+def call_address(code: Code, function: Value, result: ir.Type, *arguments: Value) -> Value:
     kind = ir.FunctionType(result, [argument.it.type for argument in arguments])
     pointer = code.builder.inttoptr(function.it, kind.as_pointer())
     return Value(code, code.builder.call(pointer, [argument.it for argument in arguments]))

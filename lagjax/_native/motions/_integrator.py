@@ -25,7 +25,7 @@ from lagjax._native.code._constants import (
     RUNNING,
     SMALLEST_STEP,
 )
-from lagjax._native.code._frame import Frame, Lane, job
+from lagjax._native.code._frame import Frame, Lane, job_structure
 from lagjax._native.code._ir import INTEGER, POINTER, Code, Value
 from lagjax._native.series._guards import Guards
 from lagjax._native.series._motion_parts import MotionParts
@@ -35,10 +35,10 @@ from lagjax._native.steps._border_control import BorderControl
 from lagjax._native.steps._events import Events
 from lagjax._native.steps._projection import Projector
 from lagjax._native.steps._roots import Roots
-from lagjax._native.steps._run_records import Output
+from lagjax._native.steps._run_records import OutputWriter
 from lagjax._native.steps._step import PARTS, StepControl
 
-JOB = job(
+JOB = job_structure(
     "Job",
     ("next_member", "ts", "y0", "params", "path", "y_end", "t_end", "code", "steps", "rejected", "record", "next_row"),
     # Strides from one member to the next: 0 where all share the output times, or the parameters.
@@ -59,10 +59,10 @@ class Integrator:
         self.base_size = nesting.base
         self.guards = 0 if guards is None else len(guards.directions)
         self.notes = guards is not None and guards.notes  # in the place of states at output times
-        fields = StepControl.fields(n) | Output.fields(n) | Events.fields(self.guards)
+        fields = StepControl.fields(n) | OutputWriter.fields(n) | Events.fields(self.guards)
         fields["active"] = 1  # 1 in a lane that has a member
         if projection is not None:
-            self.begins = _rank_drops.beginning(2 * n, self.guards, 0 if borders is None else len(borders.guards))
+            self.begins = _rank_drops.start_fields(2 * n, self.guards, 0 if borders is None else len(borders.guards))
             fields |= Projector.fields(n) | _rank_drops.fields(self.begins)
         if guards is not None:
             fields |= Roots.fields(MAX_ORDER + 2)
@@ -76,7 +76,7 @@ class Integrator:
         groups = tuple(range(n)) if error_groups is None else error_groups
         self.step = StepControl(motion, groups, self.projector, self.base_size)
         self.borders = borders and BorderControl(motion, borders, nesting, projection is not None, jump)
-        self.output = Output(motion, self.projector)
+        self.output = OutputWriter(motion, self.projector)
         roots = Roots(motion) if guards and self.borders is None else self.borders and self.borders.roots
         self.events = guards and roots and Events(motion, self.step, self.output, roots, guards)
         self.start_next = self._start_next()
@@ -112,7 +112,7 @@ class Integrator:
         largest = code.maximum(abs(begin), abs(end))
         lane["smallest"] = code.maximum(SMALLEST_STEP * largest, double(code, LEAST_STEP))
         lane["longest"] = code.maximum(abs(end - begin) * FIRST_STEP, lane["smallest"])
-        self.output.await_next(frame, lane, integer(code, 1))
+        self.output.set_due_time(frame, lane, integer(code, 1))
         for i in motion.form.each(code, self.base_size if self.projector else 0):
             lane["velocity_scale", i] = 0.0
         for i in motion.form.each(code, motion.states):
@@ -149,9 +149,9 @@ class Integrator:
             if self.projector is not None:
                 _rank_drops.retry_last_long_step(frame, self.motion.form, self.begins)
             if self.events is not None:
-                self.events.stop(frame, order)
+                self.events.end_step_at_event(frame, order)
             if crossings is not None:
-                crossings.settle(frame)
+                crossings.drop_missed_border(frame)
             with code.only_if(frame.job("room") > 0), code.loop(self.motion.width) as lane:
                 retracts = crossings is not None and crossings.crossing.retraction is not None
                 self.output.record(frame, frame.lane(lane), kicks, "unretracted" if retracts else "y")
@@ -164,7 +164,7 @@ class Integrator:
             if crossings is not None:
                 frame.call(crossings.crossing.cross)
             if self.projector is not None:
-                _rank_drops.shorten(frame)
+                _rank_drops.shorten_returned(frame)
             self._finish_members(frame, idle)
         frame.finish(self.motion.is_unfinished(frame))
 

@@ -15,7 +15,7 @@ from lagjax._native.code._ir import compile_module, lanes
 from lagjax._native.motions import _gpu
 from lagjax._native.motions._adjoint import Adjoint
 from lagjax._native.motions._derivative_handler import DerivativePlan
-from lagjax._native.motions._handler import Plan, Rest, allocate_aligned, handler
+from lagjax._native.motions._handler import Plan, UnfinishedRun, allocate_aligned, handler
 from lagjax._native.motions._integrator import Integrator
 from lagjax._native.motions._tangent import Tangent
 from lagjax._native.motions._threads import SLICE, run_in_slices, run_on_threads
@@ -68,11 +68,11 @@ class Steps(NamedTuple):
     kernel: Any = None
     rows: Any = None
 
-    def take(self, places) -> "Steps":
+    def select_members(self, places) -> "Steps":
         return self._replace(first=self.first[places], counts=self.counts[places], rows=self.rows[places])
 
     def split_members(self) -> Iterator[tuple[int, np.ndarray]]:
-        """The row of each member, and the part of the table with its steps."""
+        """Pairs of each member's row and its part of the `table` of steps."""
         for row, first, count in zip(self.rows.tolist(), self.first, self.counts, strict=True):
             yield row, self.table[first : first + count]
 
@@ -173,7 +173,7 @@ class Kernel:
     @property
     def rest_size(self) -> int:
         """The size, in doubles, of the `rest` of an unfinished run."""
-        return Rest.size(self._forward.layout)
+        return UnfinishedRun.size(self._forward.layout)
 
     def __call__(
         self, ts, y0, params, rtol, atol, max_steps, room=0, begun: RunResults | None = None, room_of_notes=0, order=0
@@ -202,10 +202,10 @@ class Kernel:
             changes = np.zeros((members, self.ending_guards))
         else:
             path, y_end, t_end, code, steps, rejected, changes, rest = begun
-            idle, _, more = Rest.counts(rest)
+            idle, _, more = UnfinishedRun.counts(rest)
             if not more:
                 return _collect_results(path, y_end, t_end, code, steps, rejected, changes, idle)
-        rest = None if begun is None else Rest.from_array(begun.rest, self._forward.layout)
+        rest = None if begun is None else UnfinishedRun.from_array(begun.rest, self._forward.layout)
         table, rows = None, np.zeros(1, np.int64)
         if room:  # the system provides pages when they are written to
             table = np.empty((room, self.states + RECORDED + self._forward.more))

@@ -17,7 +17,7 @@ from llvmlite import ir
 
 from lagjax._native.code._constants import LARGEST_LINE
 from lagjax._native.code._ir import DOUBLE, INTEGER, LINE_ARGUMENTS, POINTER, Code, Value, compile_module
-from lagjax._native.motions._handler import call, compile_handler, load_at, make_once
+from lagjax._native.motions._handler import call_address, compile_handler, load_at, make_once
 from lagjax._native.series._lanes import emit, sincos_function
 from lagjax._program import OPERATIONS, Graph, StraightLine, eliminate_dead_code, operation_error
 
@@ -321,6 +321,6 @@ def line_handler() -> int:
     def evaluate(code: Code, line: Value, data: list[Value], dims: list[Value]) -> None:
         address = Value(code, code.builder.ptrtoint(line.it, INTEGER))
         (x, given, out), (times, rows) = data, (load_at(dims[0], offset, INTEGER) for offset in (0, 8))
-        call(code, address, ir.VoidType(), x, out, rows, given, times)
+        call_address(code, address, ir.VoidType(), x, out, rows, given, times)
 
     return compile_handler("line_handler", 2, 1, lambda module: evaluate)["handler"]

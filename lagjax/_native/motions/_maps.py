@@ -259,7 +259,7 @@ class SeriesSum:
             at = frame.time(code.select(there, member, 0), code.select(there, index, 0))
             follows = (at - t) * h > 0.0
             if self.kicks:
-                follows = follows | ((h > 0.0) & (at >= t - instant_tolerance(code, at)))
+                follows = follows | ((h > 0.0) & (at >= t - instant_tolerance(at)))
             return there & follows
 
         with code.repeat_while(follows_begin):

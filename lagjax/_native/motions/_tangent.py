@@ -13,7 +13,7 @@ and that of each step replaces its number in the record.
 
 import functools
 
-from lagjax._native.code._frame import Frame, Lane, job
+from lagjax._native.code._frame import Frame, Lane, job_structure
 from lagjax._native.code._ir import INTEGER, Code, Value
 from lagjax._native.motions._maps import CauchyProducts, OrderRecursion, ProjectedEnd, SeriesSum, ZerothOrder
 from lagjax._native.motions._recorded_steps import StepReplay
@@ -22,7 +22,7 @@ from lagjax._native.series._tangent_memory import Directions
 from lagjax._native.steps._run_records import NUMBER, instant_tolerance
 
 # `y_dot` is the tangent of the start, and becomes that of the end.
-JOB = job(
+JOB = job_structure(
     "TangentJob",
     ("next_member", "ts", "params", "record", "first_step", "steps", "path_dot", "y_dot", "params_dot", "excess"),
     ("ts_stride", "params_stride", "members", "times", "order", "directions"),
@@ -41,7 +41,7 @@ class Tangent:
         self.replay = StepReplay("tangent", parts, JOB, fields, {}, width, jumps=1)
         self.motion = motion = self.replay.motion
         self.saltation, self.retraction = self.replay.saltation(), self.replay.retraction
-        self.note_border = self.saltation and self.saltation.note_end()
+        self.note_border = self.saltation and self.saltation.store_end()
         self.directions = directions = Directions(motion, parts, lanes)
         self.form, self.series_sum = directions.form, SeriesSum(motion)
         self.start_next = self.replay.start_next(self._begin_lane, lambda frame, lane, member: None)
@@ -199,7 +199,7 @@ class Tangent:
         due = inside & ((at - of_motion["next_begin"]) * of_motion["h"] <= 0.0)
         if self.replay.parts.kicks:  # outputs at the end belong to the next step, forward in time
             next_begin, h = of_motion["next_begin"], of_motion["h"]
-            due = due & code.compare("!=", h, 0.0) & ~((h > 0.0) & (at >= next_begin - instant_tolerance(code, at)))
+            due = due & code.compare("!=", h, 0.0) & ~((h > 0.0) & (at >= next_begin - instant_tolerance(at)))
         lane["s"] = code.select(due, at - of_motion["t"], 0.0)
         lane["is_due"] = code.flag(due)
 

@@ -48,7 +48,7 @@ def append_guards(program: Recurrent, size: int, values: Recurrent, slides: bool
     """A program of q̈ with guards as further outputs. Raises `Unlowerable` if a guard has no series."""
     count = len(values.line.outputs)
     whole = with_outputs(program, values.line, 2 * size + 1)
-    require_lanes(whole.line)
+    require_vectorizable(whole.line)
     try:
         if (found := borders(whole, size, slides, count)) is not None:
             return WatchedProgram(found.program, _series_of_guards(found.program, size, found.followed, count), found)
@@ -57,7 +57,7 @@ def append_guards(program: Recurrent, size: int, values: Recurrent, slides: bool
     return WatchedProgram(whole, _series_of_guards(whole, size, (), count), None)
 
 
-def require_lanes(line: StraightLine) -> None:
+def require_vectorizable(line: StraightLine) -> None:
     """Raise `Unlowerable` if a program has integer operations that vectors of doubles cannot compute."""
     for (op, _, _), kind in zip(line.nodes, line.kinds, strict=True):
         if kind not in ("float", "bool") and op not in ("input", "constant", "convert", *INTEGERS):

@@ -40,8 +40,8 @@ class Lines:
         """The Python integers below `count`: the body is emitted for each of them."""
         return iter(range(count))
 
-    def strands(self, code: Code, n: int) -> Iterator[tuple[list, dict]]:
-        """Groups of four components of a state (q, q̇); for the velocities in it {index: coordinate}."""
+    def component_groups(self, code: Code, n: int) -> Iterator[tuple[list, dict]]:
+        """The components of a state (q, q̇) in groups of four; for the velocities in each {index: coordinate}."""
         for first in range(0, 2 * n, 4):
             some = list(range(first, min(first + 4, 2 * n)))
             yield some, {k: i - n for k, i in enumerate(some) if i >= n}

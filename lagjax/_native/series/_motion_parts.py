@@ -4,7 +4,7 @@ import functools
 from dataclasses import replace
 from typing import NamedTuple
 
-from lagjax._native.series._guards import Guards, append_guards, require_lanes
+from lagjax._native.series._guards import Guards, append_guards, require_vectorizable
 from lagjax._program import (
     BESIDE,
     LOOK_UPS,
@@ -167,7 +167,7 @@ def choose_parameters(
 @functools.lru_cache(maxsize=16)  # used where the engine is chosen, and where it is compiled
 def recurrences(program: Recurrent, size: int) -> Series:
     """The Taylor series of a smooth motion. Raises `Unlowerable` if vectors of doubles cannot compute the program."""
-    require_lanes(program.line)
+    require_vectorizable(program.line)
     return series(program, size, moving=2 * size + 1)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from llvmlite import ir
 
 from lagjax._native.code._constants import TIMES
-from lagjax._native.code._frame import Frame, Numbers, Vectors, integers
+from lagjax._native.code._frame import Frame, Numbers, Vectors, integer_constant
 from lagjax._native.code._ir import DOUBLE, INTEGER, POINTER, Code, Value
 from lagjax._native.series._lanes import apply, sines_and_cosines
 from lagjax._native.series._schedule import OperationKind, Schedule, ScheduledOperation, schedule
@@ -66,7 +66,7 @@ class Tables:
             kind = plan.kinds[group[0].kind]
             if kind.op != "store" or to is not None:
                 words += self._group_words(kind, group, places)
-        table = Value(frame.code, integers(self._module, np.array([*words, 0], np.int32)))
+        table = Value(frame.code, integer_constant(self._module, np.array([*words, 0], np.int32)))
         shift = None if to is None else to.shift
         frame.call(self._execute.code, table, frame.code.as_value(0 if shift is None else shift, INTEGER))
         return frame.vectors(name, plan.staying)
@@ -77,7 +77,7 @@ class Tables:
             with code.loop(count) as i:
                 yield i
 
-    def strands(self, code: Code, n: int) -> Iterator[tuple[list, dict]]:
+    def component_groups(self, code: Code, n: int) -> Iterator[tuple[list, dict]]:
         """A loop over coordinates: each gives [coordinate, velocity], and {1: coordinate} for the velocity."""
         for i in self.each(code, n):
             yield [i, i + n], {1: i}
@@ -101,7 +101,7 @@ class Tables:
                 values[i] = numbers(i)
             return values
         largest = self.room(frame, len(names))
-        table = integers(self._module, np.array([names.index(group) for group in groups], np.int64))
+        table = integer_constant(self._module, np.array([names.index(group) for group in groups], np.int64))
         for group in self.each(code, len(names)):
             largest[group] = code.lanes_of(0.0)
         for i in self.each(code, count):
@@ -207,8 +207,8 @@ class Tables:
         """Emit `()`: store every constant at its offset, in all lanes."""
         frame, code = self._prepare, self._prepare.code
         if self._constants:
-            places = Value(code, integers(self._module, np.array([*self._constants.values()], np.int64)))
-            numbers = Value(code, integers(self._module, np.frombuffer(b"".join(self._constants), np.int64)))
+            places = Value(code, integer_constant(self._module, np.array([*self._constants.values()], np.int64)))
+            numbers = Value(code, integer_constant(self._module, np.frombuffer(b"".join(self._constants), np.int64)))
             with code.loop(len(self._constants)) as i:
                 number = code.load(code.element(numbers, i), DOUBLE)
                 code.store(code.lanes_of(number), frame.memory_at(code.load(code.element(places, i, INTEGER), INTEGER)))

@@ -15,7 +15,7 @@ import numpy as np
 from llvmlite import ir
 
 from lagjax._native.code._constants import LARGEST_LINE, LEAST_ORDER, MAX_ORDER, OPERATIONS_PER_COORDINATE
-from lagjax._native.code._frame import Fields, Frame, Index, Lane, Memory, Numbers, Vectors, integers
+from lagjax._native.code._frame import Fields, Frame, Index, Lane, Memory, Numbers, Vectors, integer_constant
 from lagjax._native.code._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native.series._lanes import Lines, sincos_function
 from lagjax._native.series._motion_parts import MotionParts
@@ -54,7 +54,7 @@ class TaylorSeries:
         self.module.triple = ""
         self.look_up = LookUps(self.module)
         self.member_stride = self.parameters if chosen is None else chosen.of
-        self._chosen = None if chosen is None else integers(self.module, np.array(chosen.positions, np.int64))
+        self._chosen = None if chosen is None else integer_constant(self.module, np.array(chosen.positions, np.int64))
         self.layout = Memory(width, self._fields() | fields)
         self.width, self.vector = self.layout.width, ir.VectorType(DOUBLE, self.layout.width)
         self.large = large
@@ -119,7 +119,7 @@ class TaylorSeries:
     def table(self, pairs, width: int | None = None) -> ir.GlobalVariable:
         """The rows of each product as a constant array of offsets from the first row, for vectors of this width."""
         flat = [row * MAX_ORDER * (width or self.width) for pair in pairs for row in pair]
-        return integers(self.module, np.array(flat or [0], np.int64))
+        return integer_constant(self.module, np.array(flat or [0], np.int64))
 
     def _row(self, frame: Frame, table, index: Value) -> Value:
         code = frame.code
@@ -193,7 +193,7 @@ class TaylorSeries:
         """P(s) − y for every component of the state, P′(s) for velocities, by Horner's scheme."""
         code, increments, slopes = frame.code, self.form.room(frame, self.states), self.form.room(frame, self.n)
         s = code.lanes_of(s)
-        for some, velocities in self.form.strands(code, self.n):
+        for some, velocities in self.form.component_groups(code, self.n):
             highest = [frame["y", i, order] for i in some]
             value = [code.variable(c) for c in highest]
             slope = {j: code.variable(code.as_number(order) * highest[j]) for j in velocities}

@@ -12,7 +12,7 @@ from lagjax._native.steps._knots import Knots
 from lagjax._native.steps._retraction import Retraction
 from lagjax._native.steps._saltation import Saltation
 from lagjax._native.steps._step import absolute_tolerance
-from lagjax._native.steps._watch import Border, Crossed, Touch, reaches_border, step_to_border
+from lagjax._native.steps._watch import Border, BorderKind, ContactKind, reaches_border, step_to_border
 from lagjax._program import SLIDE, Borders, Jump, Nesting, eliminate_dead_code
 
 _NOT_HOLDING = 1e6  # a share of a border that both sides do not push onto: those of others are near 0 … 1
@@ -41,7 +41,7 @@ class BorderCrossing:
         if jump is not None:
             saltation = Saltation(motion, self.table, nesting.base, jump)
             motion.layout.extend_by(saltation.fields_along())
-            self.jump = saltation.note(), saltation.apply()
+            self.jump = saltation.store_state(), saltation.apply()
         self.kicks = Kicks(motion, borders, self.table, nesting.base) if borders.kicking else None
         self.cross = self._cross_borders()
 
@@ -58,7 +58,7 @@ class BorderCrossing:
             for border in self.table.each(frame):
                 slide = border["slide"]
                 with code.only_if((slide >= 0) & code.compare("==", border.g, border["rest"])):
-                    border.remember(undecided & (self.table.piece(frame, slide) > 0.0), touch=Touch.SLIDING)
+                    border.remember(undecided & (self.table.piece(frame, slide) > 0.0), touch=ContactKind.SLIDING)
             frame["undecided"] = 0.0
         return frame.finish()
 
@@ -70,12 +70,16 @@ class BorderCrossing:
         """Emit `()`: after the step, set the pieces beyond the borders that it reached."""
         frame = self.motion.function("cross")
         code = frame.code
-        stepped, crosses, was_cut = frame["stepped"] > 0.0, frame["crossed"] > Crossed.NOTHING, frame["nearest"] < 1.0
+        stepped, crosses, was_cut = (
+            frame["stepped"] > 0.0,
+            frame["crossed"] > BorderKind.NOTHING,
+            frame["nearest"] < 1.0,
+        )
         if self.retraction is not None:  # borders that are left before the step begins do not take the state
             has_begun = stepped | (frame["returned"] > 0.0) if self.forgotten else stepped
             self.retraction.undo(frame, ~has_begun)
         for border in self.table.each(frame):
-            border.remember(stepped & (border.touch < Touch.SLIDING), touch=Touch.NONE)
+            border.remember(stepped & (border.touch < ContactKind.SLIDING), touch=ContactKind.NONE)
         with code.only_if(code.any_lane(crosses | was_cut)):
             # What a cut step was to be says more about the next one than what it became.
             longest = limits.GROWTH * abs(frame["planned"])
@@ -88,7 +92,7 @@ class BorderCrossing:
                 self.kicks.record_pieces(frame)
             self._pass_borders(frame, crosses)
             if self.table.groups:
-                counts = stepped & self.table.crosses(frame, Crossed.GUARD)
+                counts = stepped & self.table.crosses(frame, BorderKind.GUARD)
                 frame["steps"] = frame["steps"] + code.select(counts, frame["more"], 0.0)
             frame.assign(crosses, **self.forgotten)
             if self.kicks is not None:
@@ -110,7 +114,7 @@ class BorderCrossing:
         before = [code.variable(before[k]) for k in range(len(shaken))]
         for border in self.table.each(frame):
             self._enter_beyond(frame, border)
-        self.knots.cross(frame, going)
+        self.knots.enter_next_pieces(frame, going)
         self._redecide_dependents(frame, going)
         after = self.motion.evaluate_now(frame, line) if shaken else []
         for k, j in enumerate(shaken):
@@ -124,7 +128,7 @@ class BorderCrossing:
         """Record that the motion neither touches the borders of some pieces nor slides along them."""
         for g, guard in enumerate(self.borders.guards):
             if guard.piece in pieces:
-                frame.assign(where, g, touch=Touch.NONE)
+                frame.assign(where, g, touch=ContactKind.NONE)
                 if guard.slide >= 0:
                     frame.assign(where, self.motion.parameters + guard.slide, params=0.0)
 
@@ -137,7 +141,7 @@ class BorderCrossing:
         for j in self.borders.clocks:
             frame["stays", j] = 1.0
         for border in self.table.each(frame):
-            frame.assign(frame.code.compare("!=", border.touch, float(Touch.NONE)), border["piece"], stays=1)
+            frame.assign(frame.code.compare("!=", border.touch, float(ContactKind.NONE)), border["piece"], stays=1)
         self._redecide_piece(frame, going)
 
     def _enter_beyond(self, frame: Frame, border: Border) -> None:
@@ -149,24 +153,28 @@ class BorderCrossing:
         """
         code, hit, again, beyond = frame.code, border.is_hit, frame["stepped"] <= 0.0, frame["beyond"]
         if self.table.groups:
-            is_first = self.table.crosses(frame, Crossed.GUARD, border.g)
+            is_first = self.table.crosses(frame, BorderKind.GUARD, border.g)
             beyond = code.select(is_first, beyond, border.rule("beyond")(border.piece))
         no_time = ~again & (abs(step_to_border(frame)) <= limits.NO_TIME * frame["smallest"])
         no_time = (no_time | (~again & (frame["stops"] > 0.0))) & (frame["at_rest"] > 0.0)
         place, back, slide = border["piece"] + self.motion.parameters, border["back"], border["slide"]
         bounces = no_time & border.has("order", 2)  # by position
-        slides = bounces | (again & (border.touch > Touch.NONE))
+        slides = bounces | (again & (border.touch > ContactKind.NONE))
         if self.borders.releases:
             slides = slides | border.is_cone
         slides = hit & slides & border.has("slide")
         frame.assign(hit & ~slides, place, params=beyond)
         # A share jumps to where it is: it need not touch the border that it had crossed before.
-        frame.assign(hit, back, touch=code.select(border.has("on"), Touch.NONE, Touch.VALUE))
+        frame.assign(hit, back, touch=code.select(border.has("on"), ContactKind.NONE, ContactKind.VALUE))
         with code.only_if(slide >= 0):
             below = code.select(border.piece < beyond, border.piece, beyond)
             frame.assign(slides, place, params=code.select(border.is_sign, -1.0, below))
             frame.assign(slides, slide + self.motion.parameters, params=1)
-            for g, touch in ((border.g, Touch.NONE), (back, Touch.NONE), (border["rest"], Touch.SLIDING)):
+            for g, touch in (
+                (border.g, ContactKind.NONE),
+                (back, ContactKind.NONE),
+                (border["rest"], ContactKind.SLIDING),
+            ):
                 frame.assign(slides, g, touch=touch)
         self._leave_sliding(frame, border, hit, again)
 
@@ -186,17 +194,17 @@ class BorderCrossing:
             as_written = code.select(on.is_sign, 0.0, below + code.select(toward_zero, 0.0, 1.0))
             place = on["piece"] + self.motion.parameters
             frame.assign(hit, place, params=code.select(unheld, as_written, below + gains))
-            frame.assign(hit, border["rest"], touch=Touch.NONE)
-            on.remember(hit, touch=code.select(again, order, order + Touch.VALUE))
-            on.remember(unheld, touch=Touch.CONTINUES)
+            frame.assign(hit, border["rest"], touch=ContactKind.NONE)
+            on.remember(hit, touch=code.select(again, order, order + ContactKind.VALUE))
+            on.remember(unheld, touch=ContactKind.CONTINUES)
             if self.borders.releases:  # the vector of a cone has been given a length beyond its level
-                on.remember(hit & on.is_cone, touch=Touch.NONE)
+                on.remember(hit & on.is_cone, touch=ContactKind.NONE)
 
     def _release_cones(self, frame: Frame) -> None:
         """Give the vectors of released cones a speed in the direction of the force, twice that which counts as rest."""
         code, motion, n = frame.code, self.motion, len(self.borders.holding.release.outputs)
         shares = self.borders.releases
-        hits = [self.table.crosses(frame, Crossed.GUARD, g) for g in shares]
+        hits = [self.table.crosses(frame, BorderKind.GUARD, g) for g in shares]
         base = n // (2 * len(shares))
         with code.only_if(code.any_lane(functools.reduce(Value.__or__, hits))):
             out = motion.evaluate_now(frame, self.borders.holding.release)

@@ -5,7 +5,7 @@ from lagjax._native.code._frame import Fields, Frame
 from lagjax._native.code._ir import Code, Value
 from lagjax._native.series._taylor import TaylorSeries, integer
 from lagjax._native.steps._roots import Roots
-from lagjax._native.steps._watch import Border, Crossed, GuardTable, Touch
+from lagjax._native.steps._watch import Border, BorderKind, ContactKind, GuardTable
 from lagjax._program import SIGN, Borders
 
 _AT_END = 16.0  # roundings of the time by which the end of a motion may miss an instant and is still taken to be there
@@ -32,19 +32,19 @@ class Kicks:
         with frame.code.loop(self.motion.pieces) as j:
             frame["kick_before", j] = self.table.piece(frame, j)
 
-    def settle(self, frame: Frame, stepped: Value) -> Value:
+    def mark_recorded_steps(self, frame: Frame, stepped: Value) -> Value:
         """Set `counts` for steps that are recorded: also those of no length that end with a kick, and the last one."""
         stepped = stepped | (self.table.kicks(frame) & ~self._begins_past_jump(frame))
         frame["counts"] = stepped | (frame["last"] > 0.0)
         return stepped
 
     def _begins_past_jump(self, frame: Frame) -> Value:
-        """The lanes that start at an instant where L jumps: they have the velocities behind it already."""
+        """The lanes that start at an instant where L jumps, with velocities that are already those after the jump."""
         begins = (frame["steps"] <= 0.0) & (frame["forward"] > 0.0)
         found = frame.constant(0.0) > 0.0
         for g, guard in enumerate(self.borders.guards):
             if self._kicks_by_sign(guard.piece):
-                found = found | self.table.crosses(frame, Crossed.GUARD, g)
+                found = found | self.table.crosses(frame, BorderKind.GUARD, g)
         return begins & found & frame.code.compare("==", frame["h"], 0.0)
 
     def _kicks_by_sign(self, j: int) -> bool:
@@ -64,7 +64,7 @@ class Kicks:
             noise = _AT_END * limits.EPS * abs(frame["t_end"] / h * slope)
             there = ends & code.compare("!=", side, 0.0) & (end <= noise) & code.compare("==", frame["nearest"], one)
             beyond = guard.beyond(border.piece)
-            frame.assign(there, crossed=Crossed.GUARD, crossed_number=float(g), beyond=beyond)
+            frame.assign(there, crossed=BorderKind.GUARD, crossed_number=float(g), beyond=beyond)
 
     def _kick_velocities(self, base: int) -> Code:
         """Emit `()`: set the velocities behind the border in lanes with `kicks` = 1; 2 marks a reflection."""
@@ -108,7 +108,7 @@ class Kicks:
             with code.loop(self.motion.pieces) as j:
                 frame.assign(reflected, j + self.motion.parameters, params=frame["kick_before", j])
             for border in self.table.each(frame):
-                border.remember(reflected, touch=code.select(border.is_hit, Touch.VALUE, Touch.NONE))
+                border.remember(reflected, touch=code.select(border.is_hit, ContactKind.VALUE, ContactKind.NONE))
             frame["kicks"] = code.select(reflected, 1.0, 0.0)
             frame.call(self.kick)
         return kicks > 0.0

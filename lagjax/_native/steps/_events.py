@@ -17,13 +17,13 @@ from lagjax._native.code._ir import INTEGER, Code, Value, Variable
 from lagjax._native.series._guards import Guards
 from lagjax._native.series._taylor import TaylorSeries, double
 from lagjax._native.steps._roots import Roots
-from lagjax._native.steps._run_records import Output
+from lagjax._native.steps._run_records import OutputWriter
 from lagjax._native.steps._step import StepControl
-from lagjax._native.steps._watch import END_OF_STEP, Columns, Touch, Watch, reaches_border
+from lagjax._native.steps._watch import END_OF_STEP, Columns, ContactKind, Watch, reaches_border
 from lagjax._program import inputs_below
 
 
-class Change(IntEnum):
+class SignChange(IntEnum):
     """The direction of a sign change of a guard: it falls or rises; 0 means none."""
 
     FALLS = 1
@@ -36,7 +36,7 @@ MEMORY = ("side", "contact", "noted")  # of each guard from step to step
 class Events:
     """The kernel functions that find sign changes of guards, which are the last followed outputs."""
 
-    def __init__(self, motion: TaylorSeries, step: StepControl, output: Output, roots: Roots, guards: Guards):
+    def __init__(self, motion: TaylorSeries, step: StepControl, output: OutputWriter, roots: Roots, guards: Guards):
         self.motion, self.step, self.roots, self.guards = motion, step, roots, guards
         self.count = len(guards.directions)
         self.first = motion.series.followed - self.count
@@ -60,12 +60,12 @@ class Events:
             "measured": (guards, 5),  # where a motion begins, the outputs of the program of `Guards`
             "zero": guards,  # the value that counts as zero
             "side": guards,  # its sign where the step begins
-            "contact": guards,  # a `Touch` there
+            "contact": guards,  # a `ContactKind` there
             "noted": guards,  # how often it has been noted before
             **{f"{name}_end": guards for name in MEMORY},  # these three where the step ends
-            "met": guards,  # the `Change` at the start; 0 without any
+            "met": guards,  # the `SignChange` at the start; 0 without any
             "root_at": guards,  # how far from the beginning of the step it changes
-            "change": guards,  # the `Change` there; where the step ends there, 0 of those that come later
+            "change": guards,  # the `SignChange` there; where the step ends there, 0 of those that come later
             **END_OF_STEP,
         }
 
@@ -147,10 +147,10 @@ class Events:
         met = fresh & there & goes_on & (before * direction <= 0.0)
         if any(self.guards.holds):
             met = met | (fresh & ~on_it & (value * direction * watch.number("holds") > 0.0))
-        frame["met", g] = code.select(met, code.select(before > 0.0, Change.FALLS, Change.RISES), 0.0)
+        frame["met", g] = code.select(met, code.select(before > 0.0, SignChange.FALLS, SignChange.RISES), 0.0)
         side = code.select(on_it, code.select(met | code.compare("==", going, 0.0), before, going), value)
-        zeros = code.select(leaves, Touch.VALUE, code.select(sound, order_of_zero, Touch.RATE))
-        watch.remember(fresh, side=self._sign_of(frame, side), contact=code.select(on_it, zeros, Touch.NONE))
+        zeros = code.select(leaves, ContactKind.VALUE, code.select(sound, order_of_zero, ContactKind.RATE))
+        watch.remember(fresh, side=self._sign_of(frame, side), contact=code.select(on_it, zeros, ContactKind.NONE))
         if is_rounded:
             watch.remember(fresh, zero=code.select(on_it, value, 0.0))
 
@@ -192,7 +192,7 @@ class Events:
 
     # ---- a step ----
 
-    def stop(self, frame: Frame, order: Value) -> None:
+    def end_step_at_event(self, frame: Frame, order: Value) -> None:
         """Search the step for changes of all guards; it ends at the earliest, or where a series is not accurate."""
         code, planned = frame.code, frame["h"]
         frame.call(self.begin_sides, order)
@@ -238,7 +238,7 @@ class Events:
         frame["change", g], frame["root_at", g] = met, code.select(happened, 0.0, float("inf"))
         frame.assign(happened, first_at=0.0)
         frame["side_end", g], frame["noted_end", g] = side, frame["noted", g]
-        frame["contact_end", g] = code.select(moving, Touch.NONE, frame["contact", g])
+        frame["contact_end", g] = code.select(moving, ContactKind.NONE, frame["contact", g])
         degree, j, zero = self.motion.followed_degree(code, order), g + self.first, frame["zero", g]
         here = self._sign_of(frame, self.motion.followed_value(frame, j) - zero)
         side = code.select(code.compare("==", side, 0.0), here, side)
@@ -263,7 +263,7 @@ class Events:
 
     def _search_roots(self, watch: Watch, order: Value, degree: Value, side: Value, moving: Value) -> None:
         frame, code, roots, h = watch.frame, watch.code, self.roots, watch.frame["h"]
-        size, contact, start = roots.size(frame, degree), watch.recall("contact"), frame["poly", 0]
+        size, contact, start = roots.coefficient_sum(frame, degree), watch.recall("contact"), frame["poly", 0]
         unknown = moving & ~(abs(start) < float("inf"))
         frame.assign(unknown, code=float(limits.NOT_FINITE), last=0.0, h=0.0)
         sound, moving = size < float("inf"), moving & ~unknown
@@ -272,18 +272,18 @@ class Events:
 
         def is_long():
             last, before = (roots.last_terms(frame, degree, first) for first in (0, 3))
-            return self._is_truncated(watch, last, before, roots.size(frame, degree))
+            return self._is_truncated(watch, last, before, roots.coefficient_sum(frame, degree))
 
         roots.shorten(frame, degree, is_long)
         frame["doubt"], frame["begin"], frame["closer"] = roots.last_terms(frame, degree), 0.0, 1.0
         # A motion that begins on the surface, or has just gone through it, is not to do so by rounding.
-        continues = (contact < Touch.NONE) & (abs(start) <= limits.CONTINUOUS * size)
-        powers = code.select(continues, float(Touch.VALUE), contact)
+        continues = (contact < ContactKind.NONE) & (abs(start) <= limits.CONTINUOUS * size)
+        powers = code.select(continues, float(ContactKind.VALUE), contact)
         roots.divide(frame, degree, powers)
-        roots.sum_up(frame, degree)
+        roots.store_bounds(frame, degree)
         frame["instant"] = 0.25 * frame["smallest"] / (abs(h) * frame["part"])  # no time is known better than this
         rounding = (limits.ROOT_NOISE * limits.EPS) * watch.recall("kept")
-        matters = (rounding < float("inf")) & ~(powers > Touch.NONE)
+        matters = (rounding < float("inf")) & ~(powers > ContactKind.NONE)
         frame["unsure"] = abs(frame["poly", 1]) * frame["instant"] + code.select(matters, rounding, 0.0)
         ahead = code.variable(side)
         self._follow_roots(watch, order, degree, ahead, moving & sound)
@@ -310,15 +310,15 @@ class Events:
             frame.call(self.roots.next_root, degree)
             root = frame["root"]
             is_root = searching() & self.roots.is_found(frame)
-            self._limit_accurate_part(frame, searching() & ~is_root, self.roots.place(frame, 1.0))
+            self._limit_accurate_part(frame, searching() & ~is_root, self.roots.step_fraction(frame, 1.0))
             waits = is_root & self._ends_at_border(watch)
-            watch.remember(waits, contact_end=Touch.CONTINUES)
+            watch.remember(waits, contact_end=ContactKind.CONTINUES)
             changes = is_root & ~waits
             with code.only_if(code.any_lane(changes)):
                 s = self._refine_root(watch, order, changes, ahead.value)
                 inside = abs(s) <= abs(frame["h"])  # else of the next step
                 goes_on = self._take_changes(watch, order, changes & inside, s, ahead)
-                self.roots.turn(frame, degree, goes_on)
+                self.roots.negate(frame, degree, goes_on)
                 frame.assign(goes_on, begin=root)
                 looking.value = code.flag(goes_on)
             looking.value = code.select(changes, looking.value, 0.0)
@@ -342,7 +342,7 @@ class Events:
         """The time of a root, by Newton steps on the guard itself; 0 for a jump of the guard."""
         frame, code, root = watch.frame, watch.code, watch.frame["root"]
         scale = frame["part"] * frame["h"]
-        start, rate = root * scale, self.roots.whole_slope(frame) / scale
+        start, rate = root * scale, self.roots.undivided_slope(frame) / scale
         moving = code.flag(where & (root > 0.0))
         # Behind a zero the series knows a root that is near, which the value loses in its rounding.
         most, share = 0.1 * abs(scale), 0.5 * abs(start)
@@ -376,12 +376,12 @@ class Events:
                 frame.call(self.note, order, watch.g, s)
             goes_on = changes
         else:
-            watch.remember(counts, root_at=size, change=code.select(side > 0.0, Change.FALLS, Change.RISES))
+            watch.remember(counts, root_at=size, change=code.select(side > 0.0, SignChange.FALLS, SignChange.RISES))
             frame.assign(counts & (size < frame["first_at"]), first_at=size)
             goes_on = changes & ~counts
         ahead.value = code.select(goes_on, 0.0 - side, side)
         left = abs(frame["h"]) - size
-        watch.remember(goes_on & (left <= limits.INSTANT * frame["smallest"]), contact_end=Touch.CONTINUES)
+        watch.remember(goes_on & (left <= limits.INSTANT * frame["smallest"]), contact_end=ContactKind.CONTINUES)
         return goes_on
 
     def _bisect_change(self, watch: Watch, order: Value, ahead: Variable, where: Value) -> None:
@@ -400,7 +400,7 @@ class Events:
 
     # ---- what is noted ----
 
-    def _write_change(self, output: Output) -> Code:
+    def _write_change(self, output: OutputWriter) -> Code:
         """Emit `(order, g, s)`: record a change of guard g and the state there, in the lanes that are due."""
         frame = self.motion.function("note_change", INTEGER, INTEGER, self.motion.vector)
         code, (order, g, s) = frame.code, frame.arguments

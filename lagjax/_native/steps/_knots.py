@@ -4,7 +4,7 @@ from lagjax._native.code import _constants as limits
 from lagjax._native.code._frame import Frame
 from lagjax._native.code._ir import Value
 from lagjax._native.series._taylor import TaylorSeries
-from lagjax._native.steps._watch import Crossed, GuardTable
+from lagjax._native.steps._watch import BorderKind, GuardTable
 from lagjax._program import Borders
 
 
@@ -14,7 +14,7 @@ class Knots:
     def __init__(self, motion: TaylorSeries, borders: Borders, table: GuardTable):
         self.motion, self.borders, self.table = motion, borders, table
 
-    def look(self, frame: Frame, h: Value) -> None:
+    def end_step_at_knot(self, frame: Frame, h: Value) -> None:
         """End the step at the first knot of all tables."""
         clocks = sorted(enumerate(self.borders.clocks), key=lambda clock: clock[1] not in self.borders.kicking)
         for c, j in clocks:
@@ -22,7 +22,7 @@ class Knots:
         if self.table.movable and len(clocks) > 1:
             self._record_coincidence(frame, h)
 
-    def cross(self, frame: Frame, going: Value) -> None:
+    def enter_next_pieces(self, frame: Frame, going: Value) -> None:
         """Enter the next piece of every table that has a knot at this instant."""
         for j in self.borders.clocks:
             left, inside = self._time_to_knot(frame, j)
@@ -57,7 +57,7 @@ class Knots:
             is_inner = self.table.piece(frame, j) < float(located.table.count - 1 - located.closed)
             at_end = (frame["forward"] > 0.0) & is_inner & code.compare("==", left, nearest) & (size > 0.0)
             sooner = sooner | (inside & at_end & code.compare("==", frame["crossed"], 0.0))
-        frame.assign(sooner, nearest=left / size, crossed=Crossed.KNOT, crossed_number=float(c))
+        frame.assign(sooner, nearest=left / size, crossed=BorderKind.KNOT, crossed_number=float(c))
 
     def _record_coincidence(self, frame: Frame, h: Value) -> None:
         """Mark knots of several tables at one instant, if one of them can depend on parameters."""
@@ -69,7 +69,7 @@ class Knots:
             count = count + code.flag(at_once)
             if j in self.table.movable:
                 moves = moves + code.flag(at_once)
-        frame.assign((count > 1.0) & (moves > 0.0), crossed=Crossed.KNOTS)
+        frame.assign((count > 1.0) & (moves > 0.0), crossed=BorderKind.KNOTS)
 
     def _instant_tolerance(self, frame: Frame) -> Value:
         """The largest difference of two times that count as equal."""

@@ -8,7 +8,7 @@ from lagjax._native.code._frame import Frame
 from lagjax._native.code._ir import Value
 from lagjax._native.series._taylor import TaylorSeries, integer
 from lagjax._native.steps._roots import Roots
-from lagjax._native.steps._watch import Crossed
+from lagjax._native.steps._watch import BorderKind
 from lagjax._program import BELOW, BESIDE, FALLS, GROWS, UP_TO, Feature
 
 
@@ -18,7 +18,7 @@ class NarrowFeatures:
     def __init__(self, motion: TaylorSeries, roots: Roots, features: tuple[Feature, ...]):
         self.motion, self.roots, self.features = motion, roots, features
 
-    def look(self, frame: Frame, degree: Value, h: Value) -> None:
+    def end_step_at_feature(self, frame: Frame, degree: Value, h: Value) -> None:
         """End the step before the first of all features."""
         frame["next_approach"], first = 0.0, 0
         for feature, row in itertools.groupby(self.features):  # which shares its code: as of a chain's bonds
@@ -69,17 +69,17 @@ class NarrowFeatures:
             of_size = code.select(far, limits.ARGUMENT * limits.LARGEST_FALL, of_size)
         self.roots.polynomial(frame, j, degree, h, slope, u - start / slope)
         if kind == FALLS:  # one that rises is told by fewer terms
-            self.roots.sum_up(frame, degree)
+            self.roots.store_bounds(frame, degree)
             rises = frame["falls"] < start
             size = start + frame["rises"]
             matters = matters & ~(rises & (self.roots.last_terms(frame, degree) < limits.ARGUMENT * size))
         self.roots.shorten_to(frame, degree, of_size, absolute)
         frame.call(self.roots.first_root, degree)
-        root = self.roots.place(frame, 2.0)
+        root = self.roots.step_fraction(frame, 2.0)
         if kind in (UP_TO, FALLS):
             matters, root = self._approach(frame, kind, h, matters, root)
         sooner = matters & (root > 0.0) & (root < frame["nearest"]) & code.compare("!=", h, 0.0)
-        frame.assign(sooner, nearest=root, crossed=Crossed.NOTHING)
+        frame.assign(sooner, nearest=root, crossed=BorderKind.NOTHING)
 
     def _approach_level(self, frame: Frame, j: Value, feature: Feature, degree: Value, h: Value) -> tuple:
         """The level α + β u of a feature, whose zero is as near as a step may come.

@@ -11,7 +11,7 @@ from lagjax._native.series._tables import Tables
 from lagjax._native.steps._events import MEMORY
 
 
-def beginning(states: int, guards: int, borders: int) -> dict[str, int]:
+def start_fields(states: int, guards: int, borders: int) -> dict[str, int]:
     """The sizes of the fields that define the start of a step, for `guards` of events and guards of `borders`."""
     of_guards = dict.fromkeys(MEMORY, guards) | {"touch": borders}
     return dict.fromkeys(("y", "low"), states) | of_guards | dict.fromkeys(("t", "t_low", "steps"), 1)
@@ -53,7 +53,7 @@ def retry_last_long_step(frame: Frame, form: Lines | Tables, begins: dict[str, i
             frame[then] = code.select(new, here, there)
 
 
-def shorten(frame: Frame) -> None:
+def shorten_returned(frame: Frame) -> None:
     """Limit the next step of the lanes that have just returned."""
     code, returned = frame.code, frame["returned"] > 0.0
     size, returns = frame["h_before"], frame["returns"]

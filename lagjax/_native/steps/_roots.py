@@ -21,7 +21,7 @@ class Roots:
     """Kernel functions for the polynomial `poly`, with `degree + 1` coefficients.
 
     `first_root(degree)` finds the first root. P is known to the rounding of its largest value; if P(0) is more negative
-    than that, the root is 0. `next_root(degree)` begins at `begin`, where P may be zero; it needs `sum_up`.
+    than that, the root is 0. `next_root(degree)` begins at `begin`, where P may be zero; it needs `store_bounds`.
     """
 
     def __init__(self, motion: TaylorSeries):
@@ -62,7 +62,7 @@ class Roots:
             power.value = power.value * h
         frame["poly", degree + 1] = 0.0
 
-    def size(self, frame: Frame, degree: Value) -> Value:
+    def coefficient_sum(self, frame: Frame, degree: Value) -> Value:
         """The sum Σ |cₖ| of the coefficients, a bound of |P|."""
         code, size = frame.code, frame.code.variable(frame.constant(0.0))
         with code.loop(degree + 1) as k:
@@ -90,7 +90,7 @@ class Roots:
         """Halve the interval until the last terms are below rtol Σ |cₖ| + atol, or + `share` Σ |cₖ| if less."""
 
         def is_long():
-            size, least = self.size(frame, degree), frame.code.lanes_of(atol)
+            size, least = self.coefficient_sum(frame, degree), frame.code.lanes_of(atol)
             if share < math.inf:
                 least = frame.code.select(share * size < least, share * size, least)
             return self.last_terms(frame, degree) > size * rtol + least
@@ -126,7 +126,7 @@ class Roots:
             sign.value = code.select(code.compare("!=", c, 0.0), code.select(c > 0.0, 1, -1.0), sign.value)
         return sign.value
 
-    def whole_slope(self, frame: Frame) -> Value:
+    def undivided_slope(self, frame: Frame) -> Value:
         """The slope, at the root, of P before the division by powers of s."""
         code, slope, left = frame.code, *(frame.code.variable(frame[name]) for name in ("slope", "divided"))
         with code.repeat_while(lambda: code.any_lane(left.value > 0.0), at_most=MAX_ORDER):
@@ -139,8 +139,8 @@ class Roots:
     def is_found(self, frame: Frame) -> Value:
         return (frame["is_root"] > 0.0) & (frame["root"] < 1.0)
 
-    def place(self, frame: Frame, otherwise: float) -> Value:
-        """The root, or the end of the search, as a fraction of the step; `otherwise` if all of it was searched."""
+    def step_fraction(self, frame: Frame, otherwise: float) -> Value:
+        """The root, or the end of the search, as a fraction of the step; `otherwise` if the whole step was searched."""
         code, root, part = frame.code, frame["root"], frame["part"]
         return code.select(root < 1.0, root * part, code.select(part < 1.0, part, otherwise))
 
@@ -148,7 +148,7 @@ class Roots:
         frame = self.motion.function("first_root", INTEGER)
         frame["begin"], frame["doubt"], frame["instant"], frame["closer"] = 0.0, 0.0, EPS, 0.0
         code = frame.code
-        self.sum_up(frame, *frame.arguments)
+        self.store_bounds(frame, *frame.arguments)
 
         def size():
             return abs(frame["poly", 0]) + frame["falls"] + frame["rises"]
@@ -157,12 +157,12 @@ class Roots:
         with code.only_if(code.any_lane(least | largest)):
             times = code.select(least, 1 / SMALL**2, code.select(largest, SMALL**2, 1.0))
             self.stretch(frame, frame.arguments[0], 1.0, times)
-            self.sum_up(frame, *frame.arguments)
+            self.store_bounds(frame, *frame.arguments)
         frame["unsure"] = (ROOT_NOISE * EPS) * size()
         frame.call(self.next_root, *frame.arguments)
         return frame.finish()
 
-    def sum_up(self, frame: Frame, degree: Value) -> None:
+    def store_bounds(self, frame: Frame, degree: Value) -> None:
         """Store bounds of the fall and the rise of P, and of −P″ and P″, for `next_root`."""
         code, zero = frame.code, frame.constant(0.0)
         falls, rises, down, up = (code.variable(zero) for _ in range(4))
@@ -176,7 +176,7 @@ class Roots:
             up.value += positive * bend
         frame["falls"], frame["rises"], frame["down"], frame["up"] = falls.value, rises.value, down.value, up.value
 
-    def turn(self, frame: Frame, degree: Value, where: Value) -> None:
+    def negate(self, frame: Frame, degree: Value, where: Value) -> None:
         code = frame.code
         with code.loop(degree + 1) as k:
             c = frame["poly", k]
@@ -208,7 +208,8 @@ class Roots:
         with code.repeat_while(lambda: code.any_lane(active()), at_most=MOST_MOVES):
             here, now = x.value, active()
             value, slope = self.value_and_slope(frame, degree, here)
-            noise, left_out = at_start + along * here, frame["doubt"] * self._eighth_power(here)
+            square = here * here
+            noise, left_out = at_start + along * here, frame["doubt"] * ((square * square) * (square * square))
             error = noise + left_out
             # A slope that what is not known, and the bend, cannot undo.
             near, steep = value <= error, slope * slope > 4.0 * (bend * error)
@@ -241,11 +242,6 @@ class Roots:
         """The distance from a zero within which P cannot exceed its error, given a bound of P″."""
         code = frame.code
         return code.maximum(code.intrinsic("sqrt", 2.0 * error / bend), frame["instant"])
-
-    def _eighth_power(self, x: Value) -> Value:
-        """The power x⁸, a bound of the power after the last one at any order."""
-        square = x * x
-        return (square * square) * (square * square)
 
     def value_and_slope(self, frame: Frame, degree: Value, x: Value) -> tuple[Value, Value]:
         code = frame.code

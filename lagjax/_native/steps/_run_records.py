@@ -2,7 +2,7 @@
 
 from lagjax._native.code._constants import DONE, EPS
 from lagjax._native.code._frame import Fields, Frame, Index, Lane
-from lagjax._native.code._ir import Code, Value
+from lagjax._native.code._ir import Value
 from lagjax._native.series._taylor import AT_BORDER, TaylorSeries
 from lagjax._native.steps._projection import Projector
 
@@ -11,12 +11,12 @@ RECORDED = 4  # numbers of a step that are written down before its state: time, 
 NUMBER = 3  # the place of that; when steps are in order a tangent writes there how large its last terms are
 
 
-def instant_tolerance(code: Code, t: Value) -> Value:
+def instant_tolerance(t: Value) -> Value:
     """The largest difference from time `t` that counts as zero."""
     return _INSTANT * abs(t)
 
 
-class Output:
+class OutputWriter:
     """The kernel functions that write into the arrays of the job."""
 
     def __init__(self, motion: TaylorSeries, projector: Projector | None):
@@ -38,7 +38,7 @@ class Output:
         """The index in `path` of component i of the state at an output time of a member."""
         return (member * frame.job("times") + time_index) * self.motion.states + i
 
-    def await_next(self, frame: Frame, lane: Lane, index: Value) -> None:
+    def set_due_time(self, frame: Frame, lane: Lane, index: Value) -> None:
         """Set `due` to the next output time before the end, in the direction of the motion; infinite after the last."""
         code = frame.code
         lane["output"] = index
@@ -56,7 +56,7 @@ class Output:
         frame["reached"] = after * forward
         if kicks is not None:
             with frame.where(kicks & (frame["h"] > 0.0)):
-                frame["reached"] = after - instant_tolerance(code, after)
+                frame["reached"] = after - instant_tolerance(after)
 
         def due():
             return moving & (frame["due"] <= frame["reached"])
@@ -72,7 +72,7 @@ class Output:
                     member, index = lane["member"], lane["output"]
                     for i in self.motion.form.each(code, self.motion.states):
                         frame.write("path", self.place(frame, member, index, i), lane["between", i])
-                    self.await_next(frame, lane, index + 1)
+                    self.set_due_time(frame, lane, index + 1)
 
     def interpolate(self, frame: Frame, order: Value, s: Value) -> None:
         """Store in `between` the state at time s after the current one, projected if that is near."""

@@ -14,7 +14,7 @@ from lagjax._native.code._ir import Code, Value
 from lagjax._native.series._cotangents import Cotangents, add
 from lagjax._native.series._tangent_memory import Directions
 from lagjax._native.series._taylor import TaylorSeries
-from lagjax._native.steps._watch import Crossed, GuardTable, Hit
+from lagjax._native.steps._watch import BorderKind, GuardTable, HitKind
 from lagjax._program import Borders, Jump, Table
 
 
@@ -31,13 +31,13 @@ class Saltation:
     def fields(borders: Borders) -> Fields:
         pieces = len(borders.switches)
         return {
-            "crossed": 1,  # the `Crossed` that the step ends at
+            "crossed": 1,  # the `BorderKind` that the step ends at
             "crossed_number": 1,  # the number of that guard, or clock
             "pieces_before": pieces,  # the pieces before the border
             "hit": pieces,  # not 0 for the piece whose switching number is zero at the border
             # The number of the entry that is the level there; follows `hit`.
             **({"entry": pieces} if borders.levels_move else {}),
-            "is_hit": 1,  # a `Hit`
+            "is_hit": 1,  # a `HitKind`
             "grazes": 1,  # 1 where the rate of the switching number is zero to the tolerance
         }
 
@@ -100,7 +100,7 @@ class Saltation:
 
     def _jump_or_nan(self, code: Code, hit: Value, grazes: Value) -> Callable[[Value], Value]:
         """A function of a jump: the jump, or NaN where it does not exist (grazed border, coincident knots)."""
-        several = hit > float(Hit.BORDER)
+        several = hit > float(HitKind.BORDER)
 
         def jump_or_nan(jump: Value) -> Value:
             return code.select(grazes | (several & code.compare("!=", jump, 0.0)), float("nan"), jump)
@@ -109,7 +109,7 @@ class Saltation:
 
     # ---- in a run: the motion with its tangents ----
 
-    def note(self) -> Code:
+    def store_state(self) -> Code:
         """Emit `()`: store the state at the border where a step ends; several may be crossed there in turn."""
         frame = self.motion.function("note_before")
         stepped = self.table.counts(frame)
@@ -153,10 +153,10 @@ class Saltation:
             frame["edge", i] = moved[i]
         frame["edge_t"], frame["edge_grazes"] = frame["t"] + frame["h"], frame["grazes"]
 
-    def note_end(self) -> Code:
+    def store_end(self) -> Code:
         """Emit `()`: store the state at the border where a step ends, for tangents at the start of the next one."""
         frame = self.motion.function("note_end")
-        frame["is_hit"] = Hit.NONE
+        frame["is_hit"] = HitKind.NONE
         with frame.code.only_if(frame.code.any_lane(self.table.crosses_any(frame))):
             self._record_edge(frame)
         return frame.finish()
@@ -193,7 +193,7 @@ class Saltation:
         """Emit `()`: cotangents of the state before a border, and of parameters, from those of the state beyond."""
         motion, frame = self.motion, self.motion.function("back_border")
         code = frame.code
-        frame["crossed"] = code.select(frame["has_after"] > 0.0, frame["crossed"], Crossed.NOTHING)
+        frame["crossed"] = code.select(frame["has_after"] > 0.0, frame["crossed"], BorderKind.NOTHING)
         with code.only_if(code.any_lane(self.table.crosses_any(frame))):
             self._record_edge(frame)
             gain, tables, entries = self._cotangent_jumps(frame, frame.vectors("pieces_after", motion.pieces))
@@ -205,7 +205,7 @@ class Saltation:
             cotangents.store_entries(frame, tables, entries, 0)
         return frame.finish()
 
-    def note_after(self) -> Code:
+    def store_next_pieces(self) -> Code:
         """Emit `()`: store the pieces of a step, for cotangents at the end of the step before it."""
         frame = self.motion.function("note_after")
         with frame.code.loop(self.motion.pieces) as j:

@@ -1,9 +1,8 @@
 """Watches: numbers that are compared with a level along a step, and what is remembered of each.
 
 A watch finds the instant at which its number reaches the level from its side. If a motion starts on the level, or moves
-along it, that is remembered as a `Touch`: rounding must not decide on which side the next step begins. At the instant
-the motion enters the next piece (`Border`, `_border_control`), or it stops, or it is recorded and continues
-(`_events`).
+along it, a `ContactKind` records that: rounding must not decide on which side the next step begins. At the instant the
+motion enters the next piece (`Border`, `_border_control`), or it stops, or it is recorded and continues (`_events`).
 """
 
 import functools
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 
-from lagjax._native.code._frame import Fields, Frame, Index, integers
+from lagjax._native.code._frame import Fields, Frame, Index, integer_constant
 from lagjax._native.code._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native.series._taylor import TaylorSeries
 from lagjax._program import Affine, Borders, Level
@@ -41,7 +40,7 @@ def reaches_border(frame: Frame) -> Value:
     return frame.code.compare("==", frame["h"], step_to_border(frame))
 
 
-class Touch(IntEnum):
+class ContactKind(IntEnum):
     """The contact of a number with its level at the start of a step: none, of its value, of rates too, permanent.
 
     Values between count the rates that are zero, and one for the value. A root at the start is not searched for, and
@@ -57,7 +56,7 @@ class Touch(IntEnum):
     SLIDING = 4
 
 
-class Crossed(IntEnum):
+class BorderKind(IntEnum):
     """The border at the end of a step: none, a guard, a knot of a clock, or knots of several at one instant."""
 
     NOTHING = 0
@@ -66,8 +65,8 @@ class Crossed(IntEnum):
     KNOTS = 3
 
 
-class Hit(IntEnum):
-    """The kind of border at the end of a step: none whose instant varies, one, or several at one instant."""
+class HitKind(IntEnum):
+    """The number of borders at the end of a step whose instants can vary: none, one, or several at one instant."""
 
     NONE = 0
     BORDER = 1
@@ -113,7 +112,7 @@ class Columns:
     def __init__(self, module: ir.Module, names: Sequence[str], rows: Sequence, kind: ir.Type = INTEGER):
         self.count = len(rows)
         numbers = np.array(rows or [[0]], np.int64 if kind == INTEGER else float)
-        self._names, self._kind, self._data = names, kind, integers(module, numbers.view(np.int64))
+        self._names, self._kind, self._data = names, kind, integer_constant(module, numbers.view(np.int64))
 
     def read(self, code: Code, row: Value, name: str) -> Value:
         place = row * len(self._names) + self._names.index(name)
@@ -143,10 +142,10 @@ class Border(Watch):
     @property
     def is_hit(self) -> Value:
         """True in the lanes whose step ends at this border."""
-        is_first = self.table.crosses(self.frame, Crossed.GUARD, self.g)
+        is_first = self.table.crosses(self.frame, BorderKind.GUARD, self.g)
         if not self.table.groups:
             return is_first
-        return is_first | (self.table.crosses(self.frame, Crossed.GUARD) & (self.recall("joins") > 0.0))
+        return is_first | (self.table.crosses(self.frame, BorderKind.GUARD) & (self.recall("joins") > 0.0))
 
     @property
     def is_sign(self) -> Value:
@@ -205,7 +204,7 @@ class GuardTable(Columns):
     def piece(self, frame: Frame, j: Index) -> Value:
         return frame["params", j + self.motion.parameters]
 
-    def crosses(self, frame: Frame, kind: Crossed, number: Index | None = None) -> Value:
+    def crosses(self, frame: Frame, kind: BorderKind, number: Index | None = None) -> Value:
         """True if a step ends at a border of this kind: any one, or the one with this number."""
         code, crosses = frame.code, frame.code.compare("==", frame["crossed"], float(kind))
         if number is None:
@@ -215,8 +214,8 @@ class GuardTable(Columns):
 
     def crosses_any(self, frame: Frame) -> Value:
         """True if a step ends at a guard, or at knots that are parameters."""
-        kinds = (Crossed.GUARD, *((Crossed.KNOTS,) if self.knots else ()))
-        at_knots = [self.crosses(frame, Crossed.KNOT, c) for c, _ in self.knots]
+        kinds = (BorderKind.GUARD, *((BorderKind.KNOTS,) if self.knots else ()))
+        at_knots = [self.crosses(frame, BorderKind.KNOT, c) for c, _ in self.knots]
         return functools.reduce(Value.__or__, at_knots + [self.crosses(frame, kind) for kind in kinds])
 
     def counts(self, frame: Frame) -> Value:
@@ -226,9 +225,9 @@ class GuardTable(Columns):
     def kicks(self, frame: Frame) -> Value:
         """True if a step ends at a border at which L jumps."""
         kicking, crosses = self.borders.kicking, functools.partial(self.crosses, frame)
-        ends = [crosses(Crossed.GUARD, g) for g, guard in enumerate(self.borders.guards) if guard.piece in kicking]
-        ends += [crosses(Crossed.KNOT, c) for c, j in enumerate(self.borders.clocks) if j in kicking]
-        return functools.reduce(Value.__or__, [*ends, *([crosses(Crossed.KNOTS)] if self.movable else [])])
+        ends = [crosses(BorderKind.GUARD, g) for g, guard in enumerate(self.borders.guards) if guard.piece in kicking]
+        ends += [crosses(BorderKind.KNOT, c) for c, j in enumerate(self.borders.clocks) if j in kicking]
+        return functools.reduce(Value.__or__, [*ends, *([crosses(BorderKind.KNOTS)] if self.movable else [])])
 
     # ---- what a step ends at ----
 
@@ -239,7 +238,7 @@ class GuardTable(Columns):
         """
         code, moves = frame.code, self.borders.levels_move
         with frame.where(where):
-            frame["is_hit"] = Hit.NONE
+            frame["is_hit"] = HitKind.NONE
             with code.loop(self.motion.pieces) as j:
                 frame["hit", j], frame["pieces_before", j] = 0.0, self.piece(frame, j)
                 if moves:
@@ -249,14 +248,14 @@ class GuardTable(Columns):
             decided = code.compare("!=", border.rule("side")(frame["pieces_before", j]), 0.0)
             if self.borders.kicking:  # where L jumps, a motion that begins on the border comes from what L is there
                 decided = decided | self.kicks(frame)
-            with frame.where(where & self.crosses(frame, Crossed.GUARD, border.g) & decided):
-                frame["hit", j], frame["is_hit"] = 1, Hit.BORDER
+            with frame.where(where & self.crosses(frame, BorderKind.GUARD, border.g) & decided):
+                frame["hit", j], frame["is_hit"] = 1, HitKind.BORDER
                 if moves:
                     frame["entry", j] = border.piece + border.rule("level").offset
         for k, (c, j) in enumerate(self.knots):
-            several = where & self.crosses(frame, Crossed.KNOTS)
-            with frame.where(several | (where & self.crosses(frame, Crossed.KNOT, c))):
+            several = where & self.crosses(frame, BorderKind.KNOTS)
+            with frame.where(several | (where & self.crosses(frame, BorderKind.KNOT, c))):
                 # Where several coincide no rational directions of theirs cancel, to a jump of nothing.
-                frame["hit", j], frame["is_hit"] = math.exp(k), code.select(several, Hit.SEVERAL, Hit.BORDER)
+                frame["hit", j], frame["is_hit"] = math.exp(k), code.select(several, HitKind.SEVERAL, HitKind.BORDER)
                 if moves:
                     frame["entry", j] = self.piece(frame, j) + code.flag(frame["h"] > 0.0)

@@ -32,9 +32,9 @@ from lagjax._run._trajectory import (
     RunSettings,
     State,
     Trajectory,
-    follow_in_doubles,
-    follow_in_numbers,
-    follow_rows,
+    run_in_doubles,
+    run_rows,
+    run_single,
     step_counts,
 )
 from lagjax._run.contacts._contact_motion import (
@@ -43,9 +43,9 @@ from lagjax._run.contacts._contact_motion import (
     RoundRecord,
     RowPlaces,
     contact_motion,
-    count_held_rows,
-    follow_concrete,
-    held_row_count,
+    count_independent_rows,
+    count_row_flags,
+    integrate_concrete,
 )
 from lagjax._run.contacts._contact_search import find_start_width
 from lagjax._run.jumps import tolerances_of
@@ -62,22 +62,22 @@ from lagjax._scene import (
 CHANGES = 1024  # the budget of changes of a motion whose crossings are asked for; what they record takes memory
 
 
-def follow_contacts(given: Problem, problem: Problem, max_transitions: int | None) -> Trajectory:
+def simulate_contacts(given: Problem, problem: Problem, max_transitions: int | None) -> Trajectory:
     """The motion of a problem with contacts; `problem` is `given` with closed-over arrays as parameters."""
     plan, *scenes = _plan_contacts(problem, max_transitions)
     _require_valid_contacts(problem, *scenes)
     if has_constraints(problem.system):
         q0, qdot0 = map(problem.layout.restore, halves(jnp.asarray(problem.y0)))
         require_consistent(problem.system, problem.layout, problem.ts, q0, qdot0, problem.params)
-    found = _put_on_device(_follow_contacts(plan, problem)) if problem.is_known else _follow_compiled(plan, problem)
+    found = _put_on_device(_simulate_contacts(plan, problem)) if problem.is_known else _follow_compiled(plan, problem)
     return dataclasses.replace(found, ts=jnp.asarray(given.ts), system=given.system, params=given.params)
 
 
-def _follow_contacts(plan: ContactPlan, problem: Problem) -> Trajectory:
+def _simulate_contacts(plan: ContactPlan, problem: Problem) -> Trajectory:
     return _trajectory(problem, problem, *_contact_outcome(plan, problem), None, plan.max_transitions)
 
 
-_follow_compiled = compile_for_one_call(_follow_contacts)  # outside of `jit` one program, and not one an operation
+_follow_compiled = compile_for_one_call(_simulate_contacts)  # outside of `jit` one program, and not one an operation
 
 
 def _put_on_device(trajectory: Trajectory) -> Trajectory:
@@ -86,28 +86,30 @@ def _put_on_device(trajectory: Trajectory) -> Trajectory:
     return eqx.combine(jax.device_put(numbers), rest)
 
 
-def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int | None, params, params_axes) -> Trajectory:
+def simulate_contact_batch(given: Batch, batch: Batch, max_transitions: int | None, params, params_axes) -> Trajectory:
     """The motions of a batch whose system has contacts."""
-    plan, *_ = _plan_contacts(batch.whole, max_transitions)
+    plan, *_ = _plan_contacts(batch.with_all_times, max_transitions)
     if batch.is_known:
-        found = follow_rows(functools.partial(follow_concrete, plan), batch.member, batch.ts, batch.y0, batch.vectors)
+        found = run_rows(functools.partial(integrate_concrete, plan), batch.member, batch.ts, batch.y0, batch.vectors)
     else:
-        found = batch.map_members(lambda problem: follow_in_doubles(functools.partial(contact_motion, plan), problem))
+        found = batch.map_members(lambda problem: run_in_doubles(functools.partial(contact_motion, plan), problem))
     ending, record, impacts = found
-    trajectory = _trajectory(given.whole, batch.whole, ending, record, impacts, None, plan.max_transitions, params_axes)
+    trajectory = _trajectory(
+        given.with_all_times, batch.with_all_times, ending, record, impacts, None, plan.max_transitions, params_axes
+    )
     return dataclasses.replace(_put_on_device(trajectory), params=params)
 
 
 def _contact_outcome(plan: ContactPlan, problem: Problem) -> tuple[ContactEnding, RoundRecord, tuple]:
     if not problem.is_known:
-        return follow_in_doubles(functools.partial(contact_motion, plan), problem)
-    return follow_in_numbers(functools.partial(follow_concrete, plan), problem)
+        return run_in_doubles(functools.partial(contact_motion, plan), problem)
+    return run_single(functools.partial(integrate_concrete, plan), problem)
 
 
-def note_sections(problem: Problem, functions: tuple, directions: tuple[int, ...], room: int) -> tuple:
+def find_section_changes(problem: Problem, functions: tuple, directions: tuple[int, ...], room: int) -> tuple:
     """The changes of a motion with contacts: the section of each, or −1; its time and state; result and end.
 
-    Raises `ValueError` as `follow_contacts` does.
+    Raises `ValueError` as `simulate_contacts` does.
     """
     plan, *scenes = _plan_contacts(problem, CHANGES + len(functions) * (room + 1))
     _require_valid_contacts(problem, *scenes)
@@ -135,7 +137,7 @@ def _plan_contacts(problem: Problem, max_transitions: int | None) -> tuple[Conta
                 "With friction impacts='poisson' is for one contact in a plane: leave out slip, or take Newton's law, "
                 "impacts='simultaneous'."
             )
-        held = np.ones(held_row_count(shapes, wide.layout.size))
+        held = np.ones(count_row_flags(shapes, wide.layout.size))
         inside = ContactParams(
             wide.params, Contacts(np.ones(shapes.count), np.ones(r), np.ones((r, d)), held, np.ones(()))
         )
@@ -143,7 +145,7 @@ def _plan_contacts(problem: Problem, max_transitions: int | None) -> tuple[Conta
             Problem.from_system(of, wide.layout, inside) for of in (scene, ContactScene(problem.system, is_open=True))
         )
         flat, holds = FlatContacts.from_system(problem.system, wide.layout, wide.params), closed
-        if held.size and (slots := count_held_rows(closed.derivation.lowered, flat)):
+        if held.size and (slots := count_independent_rows(closed.derivation.lowered, flat)):
             scene = dataclasses.replace(scene, slots=slots)
             holds = Problem.from_system(scene, wide.layout, inside)
         if refusal := MachineCode().refuses(free) or holds.derivation.lowered.accelerations.lacks:
@@ -233,7 +235,7 @@ def contact_forces(trajectory: Trajectory, name: str):
         scene = ContactScene(system)
         if contacts.held.shape[-1]:
             whole = derivation_of(scene, layout, inside).lowered
-            scene = dataclasses.replace(scene, slots=count_held_rows(whole, flat))
+            scene = dataclasses.replace(scene, slots=count_independent_rows(whole, flat))
         derivation = derivation_of(scene, layout, inside).with_numbers().lowered
         program = line_of(derivation.accelerations.multipliers)
         numbers = eqx.filter(params, eqx.is_array_like)

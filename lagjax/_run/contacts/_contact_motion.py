@@ -96,10 +96,10 @@ def contact_motion(
     ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
     numbers, scene = eqx.filter(params, eqx.is_array_like), scene_of(plan, layout, params, len(ts))
     given = ts, y0, vector_of(numbers).astype(float), scene.flat.restitution(numbers), scene.flat.friction(numbers)
-    return _arrange_outcome(scene, *scene.replay.follow(*given), given[:3])
+    return _arrange_outcome(scene, *scene.replay.search_and_replay(*given), given[:3])
 
 
-def follow_concrete(plan: ContactPlan, layout: Layout, params: PyTree, ts, y0, vectors) -> tuple:
+def integrate_concrete(plan: ContactPlan, layout: Layout, params: PyTree, ts, y0, vectors) -> tuple:
     """The motions of N members with concrete numbers: `y0` (N, 2n), `ts` (N or 1, T), `vectors` (N or 1, P).
 
     `params` are those of one member. The records are as long as the largest number of changes.
@@ -161,7 +161,7 @@ def _arrange_outcome(scene: SearchedScene, found: Found, row, played: Played, in
 def scene_of(plan: ContactPlan, layout: Layout, params: PyTree, times: int) -> SearchedScene:
     """The prepared scene for parameters of this structure and a number of outputs."""
     flat = FlatContacts.from_system(plan.scene.system, layout, params)
-    inside = ContactParams(params, opened(flat, layout.size))
+    inside = ContactParams(params, open_contacts(flat, layout.size))
     numbers = vector_of(eqx.filter(inside, eqx.is_array_like))
     system = plan.scene.system
     closed, other, whole = (
@@ -192,7 +192,7 @@ def _make_scene(
             return make_flow(of, scene.path, find().guards(remembers=True))
 
         modes.append(Mode(make, watches, find, make_lines))
-    doing, inputs = k + r + r * d + held_row_count(shapes, n) + 1, len(derivation.scalar_shapes)
+    doing, inputs = k + r + r * d + count_row_flags(shapes, n) + 1, len(derivation.scalar_shapes)
     response = whole.accelerations.impact_response(places.all, doing, open_derivation)
     bends = response.select_outputs(range(len(response.line.outputs))[-len(places.all) :][:k])
     acceleration = line_of((open_derivation if corners is None else derivation).accelerations.program, n)
@@ -234,19 +234,19 @@ def _flat_functions(derivation: Derivation, scene: ContactScene, structure, code
     )
 
 
-def opened(flat: FlatContacts, n: int) -> Contacts:
+def open_contacts(flat: FlatContacts, n: int) -> Contacts:
     """The contact states, for n coordinates, in which all are open."""
-    (k, r), d, held = (flat.shapes.count, flat.rough.size), flat.shapes.directions, held_row_count(flat.shapes, n)
+    (k, r), d, held = (flat.shapes.count, flat.rough.size), flat.shapes.directions, count_row_flags(flat.shapes, n)
     return Contacts(np.zeros(k), np.ones(r), np.ones((r, d)), np.zeros(held), np.zeros(()))
 
 
-def held_row_count(shapes: ContactShapes, n: int) -> int:
+def count_row_flags(shapes: ContactShapes, n: int) -> int:
     """The size of `Contacts.held` for n coordinates."""
     rows = shapes.count + shapes.rough.size * shapes.directions
     return rows if rows > n else 0
 
 
-def count_held_rows(whole: Derivation, flat: FlatContacts) -> tuple[int, int] | None:
+def count_independent_rows(whole: Derivation, flat: FlatContacts) -> tuple[int, int] | None:
     """The most independent rows of gaps, and of velocities, active at once; None to keep all rows.
 
     They are ranks at random states, for rows without corners. The slips of few contacts may add more to the rank of
@@ -254,7 +254,7 @@ def count_held_rows(whole: Derivation, flat: FlatContacts) -> tuple[int, int] | 
     """
     places, shapes, n = RowPlaces.from_derivation(whole, flat), flat.shapes, whole.layout.size
     if (
-        not held_row_count(shapes, n)
+        not count_row_flags(shapes, n)
         or shapes.count > flat.gap_count
         or corners_of(whole, places.all, shapes) is not None
     ):
@@ -273,7 +273,7 @@ def count_held_rows(whole: Derivation, flat: FlatContacts) -> tuple[int, int] | 
     sets = [list(x) for size in range(1, gaps) for x in itertools.combinations(range(len(slips)), size)]
     most = [rank(normal[x], slips[x].ravel()) - rank(normal[x]) for x in sets]
     slots = gaps, max([*most, rank(places.normal, slips.ravel()) - gaps])
-    return slots if sum(slots) < held_row_count(shapes, n) else None
+    return slots if sum(slots) < count_row_flags(shapes, n) else None
 
 
 def _all_multipliers(derivation: Derivation, scene: ContactScene, flat: FlatContacts) -> Program:

@@ -9,16 +9,16 @@ contacts in any state (`ContactParams`). When a watch becomes negative,
     the slip          it sticks
     μ²λ² − f²         it slides, against the force that held it
 
-The kernel finds the instant (`_native.steps._events`), `find_change` the impulses, `move` the velocities.
+The kernel finds the instant (`_native.steps._events`), `find_change` the impulses, `apply_change` the velocities.
 
 A wrong guess is a watch that starts negative, or whose first coefficient above rounding is negative: it falls at once,
 and the next round takes the guess back (`_native.steps._events`). That is Murty's principal pivoting, over series in
 place of numbers (Murty, Linear Algebra Appl. 5 (1972) 65; Heemels, Schumacher & Weiland, ibid. 294 (1999) 93). Bounces
 that accumulate end at a closed form of their limit (`end_bounces`).
 
-    follow ─► begin ─► prepare: sides and rounding of all watches ─► the kernel ─► finish ─► decide: a row of the record
-                          ▲                                                                     │
-                          └─────────────────────────────────────────────────────────────────────┘
+    start_contacts ─► prepare_stretch ─► the kernel ─► process_stretch ─► change_contacts: a row of the record
+                             ▲                                                   │
+                             └───────────────────────────────────────────────────┘
 
 `scene` has sizes, addresses of machine code, and the offsets of the fields of a member's memory (`member`) and of a
 `row` of the record; they are declared in `_places`. A flag is 0 or 1. `work` is scratch memory. Functions write their
@@ -37,7 +37,7 @@ from lagjax._run.contacts._law import (
     find_impulses,
     find_pattern,
     find_violations,
-    hold_rows,
+    select_rows,
 )
 from lagjax._run.contacts._places import Entry, Member, Room, Scene
 from lagjax._run.jumps import GOING, LEAST, bind_law, bind_loops, copy, find_sign
@@ -80,7 +80,7 @@ BEYOND, BEFORE = 16.0 * EPS, 64.0 * SMALLEST_STEP
 ON_CORNER = 1e-10
 INFINITY, MISSING = float("inf"), float("nan")
 OPEN, HELD = range(2)  # the modes
-watch, write_times, write_outputs = bind_loops(globals())
+write_watches, write_times, write_outputs = bind_loops(globals())
 
 
 # ---- what is known at a state ----
@@ -106,7 +106,7 @@ def open_all(scene: Scene, x: Floats, opened: Floats):
 
 
 @loop
-def find_held(scene: Scene, x: Floats) -> int:
+def find_scene_mode(scene: Scene, x: Floats) -> int:
     """The mode at inputs x: `HELD` if any contact is closed, else `OPEN`."""
     for i in range(scene.k):
         if x[2 * scene.n + 1 + scene.numbers + i] > 0:
@@ -117,7 +117,7 @@ def find_held(scene: Scene, x: Floats) -> int:
 @loop
 def find_mode(scene: Scene, member: Member) -> int:
     """The mode of the next stretch of a member."""
-    return find_held(scene, member.x)
+    return find_scene_mode(scene, member.x)
 
 
 @loop
@@ -131,10 +131,10 @@ def has_missed(scene: Scene, member: Member, watches: Floats, i: int, closed: bo
 
 
 @loop
-def touch(scene: Scene, member: Member, opened: Floats, room: Room):
+def write_touching(scene: Scene, member: Member, opened: Floats, room: Room):
     """Write the contacts that touch, their separation speeds, and the rounding of these; all are open in the inputs."""
     total, watches = scene.watches, room.watched
-    watch(scene, member, opened, OPEN, watches, room.free)
+    write_watches(scene, member, opened, OPEN, watches, room.free)
     for i in range(scene.k):
         value, noise, is_gap = watches[i], watches[2 * total + i] + watches[3 * total + i], i < scene.gaps
         room.touches[i] = float((abs(value) if is_gap else value) <= noise)
@@ -193,7 +193,7 @@ def locate_corners(scene: Scene, member: Member, x: Floats, room: Room) -> float
 
 
 @loop
-def go_beyond(scene: Scene, member: Member, x: Floats, room: Room) -> float:
+def write_corner_move(scene: Scene, member: Member, x: Floats, room: Room) -> float:
     """Write the displacement of the state beyond the corners that are passed; the time that it takes.
 
     Negative if the motion rests on one.
@@ -221,7 +221,7 @@ def go_beyond(scene: Scene, member: Member, x: Floats, room: Room) -> float:
 
 
 @loop
-def begin(scene: Scene, member: Member, room: Room) -> int:
+def start_contacts(scene: Scene, member: Member, room: Room) -> int:
     """The result of a start, whose inputs and coefficients are set, with all contacts open: `GOING` if it is valid.
 
     The gaps of contacts that touch and do not separate fall at once.
@@ -232,7 +232,7 @@ def begin(scene: Scene, member: Member, room: Room) -> int:
         member.fresh[g] = 1.0
     for i in range(2 * n):
         member.largest[i] = abs(x[i])
-    touch(scene, member, x, room)
+    write_touching(scene, member, x, room)
     for s in range(scene.sections):
         member.came[s] = find_sign(watches[total + deciding + s])
     evaluate(scene.response, x, room.gradients)
@@ -272,7 +272,7 @@ def rests_on_corner(scene: Scene, member: Member, room: Room) -> bool:
             is_there = abs(corners[p]) <= corners[2 * scene.corners + p]
             if scene.touch[p * k + i] > 0 and room.touches[i] > 0 and is_there:
                 passed[p] = 1.0
-    later = go_beyond(scene, member, x, room)
+    later = write_corner_move(scene, member, x, room)
     for i in range(2 * n):
         x[i] += room.shift[i]
     x[2 * n] += max(later, 0.0)
@@ -336,7 +336,7 @@ def has_paradox(scene: Scene, member: Member, push: Floats, sticks: Floats, dire
 
 
 @loop
-def note_rounding(scene: Scene, member: Member, duration: float):
+def record_rounding(scene: Scene, member: Member, duration: float):
     """Record the largest rounding of each watch so far, also of one that was inactive in between."""
     total, watches, kinds = scene.watches, member.guards, member.kinds
     values, rates = member.rounding, member.rate_rounding
@@ -385,7 +385,7 @@ def write_sides(scene: Scene, member: Member, sides: Floats, rates: Floats):
 
 
 @loop
-def prepare(scene: Scene, member: Member, ts: Floats, times: Floats, y: Floats, numbers: Floats, room: Room):
+def prepare_stretch(scene: Scene, member: Member, ts: Floats, times: Floats, y: Floats, numbers: Floats, room: Room):
     """Write the run of a member's next stretch: its times (T + 2,), its start, and its numbers with the sides."""
     n, k, r, total = scene.n, scene.k, scene.r, scene.watches
     x, kinds, stays = member.x, member.kinds, member.stays
@@ -393,13 +393,13 @@ def prepare(scene: Scene, member: Member, ts: Floats, times: Floats, y: Floats, 
     if scene.corners > 0:
         x[scene.inputs - 1] = locate_corners(scene, member, x, room)
     watches = member.guards
-    watch(scene, member, x, find_held(scene, x), watches, room.free)
+    write_watches(scene, member, x, find_scene_mode(scene, x), watches, room.free)
     member.missed = 0.0
     for g in range(total):
         kinds[g] = did[g] if g < k + r else 0.0
         if g < k and member.fresh[g] == 0 and has_missed(scene, member, watches, g, did[g] > 0):
             member.missed = 1.0
-    note_rounding(scene, member, 0.0)
+    record_rounding(scene, member, 0.0)
     used = scene.inputs - 2 * n - 1
     copy(x[2 * n + 1 :], numbers, used)
     sides, rates = numbers[used:], numbers[used + total :]
@@ -413,7 +413,7 @@ def prepare(scene: Scene, member: Member, ts: Floats, times: Floats, y: Floats, 
 
 
 @loop
-def finish(
+def process_stretch(
     scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, record: Entry, found: Floats, y_end: Floats,
     t_end: float, fell: Floats, event: int, result: int, accepted: float, rejected: float, room: Room
 ):  # fmt: skip
@@ -446,7 +446,7 @@ def finish(
     if crosses or not happens:
         copy(y_end, x, 2 * n)
         x[2 * n] = t_end
-    note_stretch(scene, member, first if happens else -1, at_once, t_end - start, accepted)
+    record_stretch(scene, member, first if happens else -1, at_once, t_end - start, accepted)
     member.accepted += accepted
     member.rejected += rejected
     reached = SUCCESSFUL if happens else result
@@ -454,7 +454,7 @@ def finish(
     copy(x[n:], row.before, n)
     copy(x, row.stop, 2 * n)
     if decides:
-        reached = decide(scene, member, first, row, room)
+        reached = change_contacts(scene, member, first, row, room)
     elif happens:  # a section, of which a note is made
         member.came[first - deciding] = 2.0 * fell[first] - 3.0
         row.contact, row.change = float(k + first - deciding), -1.0
@@ -495,7 +495,7 @@ def find_result(scene: Scene, member: Member, reached: int, happens: bool) -> in
 
 
 @loop
-def note_stretch(scene: Scene, member: Member, first: int, at_once: bool, duration: float, accepted: float):
+def record_stretch(scene: Scene, member: Member, first: int, at_once: bool, duration: float, accepted: float):
     """Record, after a stretch, ties, its longest step, and rounding; watch `first` fell at its end."""
     k, r, total = scene.k, scene.r, scene.watches
     tied, refuted, did = member.tied, member.refuted, member.kinds
@@ -506,7 +506,7 @@ def note_stretch(scene: Scene, member: Member, first: int, at_once: bool, durati
         tied[g] = float(at_once and (tied[g] > 0 or ties))
     for i in range(k):
         refuted[i] = float(at_once and (refuted[i] > 0 or (i == first and did[i] > 0)))
-    note_rounding(scene, member, duration)
+    record_rounding(scene, member, duration)
     for g in range(total):
         member.fresh[g] *= float(at_once)
     if not at_once:
@@ -528,7 +528,7 @@ def check_outputs(scene: Scene, member: Member, ts: Floats, path: Floats, did: F
             copy(path[j * 2 * n :], x, 2 * n)
             x[2 * n] = ts[j]
             copy(did[j * doing :], x[2 * n + 1 + scene.numbers :], doing)
-            watch(scene, member, x, find_held(scene, x), watches, watches[5 * scene.watches :])
+            write_watches(scene, member, x, find_scene_mode(scene, x), watches, watches[5 * scene.watches :])
             for i in range(k):
                 if has_missed(scene, member, watches, i, did[j * doing + i] > 0):
                     member.result = float(MISSED)
@@ -537,7 +537,7 @@ def check_outputs(scene: Scene, member: Member, ts: Floats, path: Floats, did: F
 
 @loop
 def find_first(scene: Scene, fell: Floats, at_once: bool, did: Floats) -> int:
-    """The watch to process first among those that `fell` (G,): of corners, then of friction, as one that jams is."""
+    """The index of the watch to process first among those that `fell` (G,): corners before friction before the rest."""
     k, r, rough = scene.k, scene.r, scene.rough
     for g in range(k + r, k + r + 2 * scene.corners):
         if fell[g] > 0:
@@ -555,8 +555,8 @@ def find_first(scene: Scene, fell: Floats, at_once: bool, did: Floats) -> int:
 
 
 @loop
-def decide(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> int:
-    """The result after watch `first` fell: set the new state of the member, and record it in the row."""
+def change_contacts(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> int:
+    """Update a member after watch `first` fell, record the change in the row, and return the result code."""
     n, k, r, x, meets, opening = scene.n, scene.k, scene.r, member.x, row.meets, room.opening
     closed = x[2 * n + 1 + scene.numbers :]
     copy(closed, room.closed, k)
@@ -565,28 +565,28 @@ def decide(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> 
         meets[i], opening[i] = float(i == first and closed[i] == 0), 0.0
     later, at_corner = 0.0, 0
     if scene.corners > 0:
-        at_corner = meet_corners(scene, member, first, meets, room)
+        at_corner = pass_corners(scene, member, meets, room)
         later = room.later
     open_all(scene, x, member.opened)
     evaluate(scene.response, member.opened, room.gradients)
-    missed = meet(scene, member, meets, row, room)
+    missed = write_participants(scene, member, meets, row, room)
     hits = row.hits > 0
     measure_slips(scene, member, room.rates, x[n:], room.slips, room)
     close_contacts(scene, member, first, hits, meets, room)
     undecided = find_change(scene, member, hits, row, room)
-    stay_closed(scene, member, hits, room)
-    note_changes(scene, member, first, hits, row, room)
+    close_pressing(scene, member, hits, room)
+    record_changes(scene, member, first, hits, row, room)
     if r > 0:
-        rub(scene, member, first, hits, room)
+        decide_sticking(scene, member, first, hits, room)
         write_directions(scene, closed[k + r :], room.free)
         if has_paradox(scene, member, closed, closed[k:], room.free, room):
             undecided = True
-    fits = hold_independent(scene, closed, room)
+    fits = write_independent_rows(scene, closed, room)
     count_doubts(scene, member, hits, row, room)
-    move(scene, member, first, meets, row, room)
+    apply_change(scene, member, first, meets, row, room)
     x[2 * n] += later
     row.later_on = later
-    name_change(scene, first, hits, closed, row, room)
+    write_change_name(scene, first, hits, closed, row, room)
     if at_corner == 2 or (missed and at_corner == 1):
         return AT_CORNER
     if missed:
@@ -595,7 +595,7 @@ def decide(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> 
 
 
 @loop
-def hold_independent(scene: Scene, did: Floats, room: Room) -> bool:
+def write_independent_rows(scene: Scene, did: Floats, room: Room) -> bool:
     """Write the independent rows by which contacts are held; returns whether there are enough slots.
 
     `did` has the contact states. Scenes with fewer rows than coordinates hold all rows.
@@ -604,7 +604,7 @@ def hold_independent(scene: Scene, did: Floats, room: Room) -> bool:
     if scene.gap_slots + scene.slots == 0:
         return True
     held, velocities = did[k + r + r * d :], 0
-    hold_rows(k, r, d, scene.rough, room.coupling, did, did[k:], held, room.free)
+    select_rows(k, r, d, scene.rough, room.coupling, did, did[k:], held, room.free)
     for i in range(k + r * d):
         if i < scene.gaps:
             gaps += int(held[i])
@@ -614,7 +614,7 @@ def hold_independent(scene: Scene, did: Floats, room: Room) -> bool:
 
 
 @loop
-def note_changes(scene: Scene, member: Member, first: int, hits: bool, row: Entry, room: Room):
+def record_changes(scene: Scene, member: Member, first: int, hits: bool, row: Entry, room: Room):
     """Record which contacts have changed, as `CHANGED`, which watches restart, and which slips start at rest."""
     n, k, x, leaves_rest = scene.n, scene.k, member.x, False
     closed = x[2 * n + 1 + scene.numbers :]
@@ -636,8 +636,8 @@ def note_changes(scene: Scene, member: Member, first: int, hits: bool, row: Entr
 
 
 @loop
-def meet_corners(scene: Scene, member: Member, first: int, meets: Floats, room: Room) -> int:
-    """Write which contacts reach a corner where watch `first` fell, and open there; move the state beyond it.
+def pass_corners(scene: Scene, member: Member, meets: Floats, room: Room) -> int:
+    """Write which contacts reach a corner, and open there; move the state beyond it.
 
     Returns 2 if one is struck at its corner, or stays there, 1 if one closes behind its corner, else 0.
     """
@@ -656,28 +656,30 @@ def meet_corners(scene: Scene, member: Member, first: int, meets: Floats, room: 
         for i in range(k):
             if passed[p] > 0 and touches[p * k + i] > 0 and closed[i] > 0:
                 opening[i] = 1.0
-    later = go_beyond(scene, member, x, room)
+    later = write_corner_move(scene, member, x, room)
     room.later = max(later, 0.0)
     return 2 if later < 0 else answer
 
 
 @loop
-def meet(scene: Scene, member: Member, meets: Floats, row: Entry, room: Room) -> bool:
-    """Write which contacts take part where some `meets` close, and their roles; the row tells if it is an impact.
+def write_participants(scene: Scene, member: Member, meets: Floats, row: Entry, room: Room) -> bool:
+    """Write which contacts take part in the change at contacts `meets`, and their roles.
+
+    The row tells if it is an impact.
 
     Returns whether its root was missed before.
     """
     k, touches, involved, noise = scene.k, room.touches, room.involved, room.noise
     parting, push, linked = room.parting, room.push, room.stay
     closed, fastest, hits, missed = room.closed, 0.0, False, False
-    touch(scene, member, member.opened, room)
+    write_touching(scene, member, member.opened, room)
     for i in range(k):
         if meets[i] > 0 or closed[i] > 0 or i >= scene.gaps:
             touches[i] = 1.0
         noise[i] = max(noise[i], 0.01 * member.rate_rounding[i])
         hits = hits or (meets[i] > 0 and parting[i] < -noise[i])
         missed = missed or (meets[i] > 0 and has_missed(scene, member, room.watched, i, closed[i] > 0))
-    reach(scene, meets, linked, room)
+    spread_impulse(scene, meets, linked, room)
     for i in range(k):
         involved[i] = meets[i] if scene.law == SEQUENTIAL else linked[i]
     if hits:
@@ -695,8 +697,8 @@ def meet(scene: Scene, member: Member, meets: Floats, row: Entry, room: Room) ->
 
 
 @loop
-def reach(scene: Scene, meets: Floats, found: Floats, room: Room):
-    """Write the touching contacts that an impulse at those in `meets` reaches, directly or through others."""
+def spread_impulse(scene: Scene, meets: Floats, found: Floats, room: Room):
+    """Write into `found` (k,) the touching contacts that an impulse at `meets` reaches, or spreads to."""
     k, r, d, coupling, rough = scene.k, scene.r, scene.d, room.coupling, scene.rough
     size, touches, reached, done, count = k + r * d, room.touches, room.free, 0, 0
     copy(meets, found, k)
@@ -735,13 +737,13 @@ def find_pushes(scene: Scene, member: Member, row: Entry, room: Room):
     for i in range(k):
         none[i] = 0.0
     find_pattern(k, r, d, rough, mu, coupling, rates, involved, none, push, stuck, direction, more)
-    hold_rows(k, r, d, rough, coupling, push, stuck, row.compressed, more)
+    select_rows(k, r, d, rough, coupling, push, stuck, row.compressed, more)
     find_impulses(k, r, d, rough, mu, coupling, rates, push, stuck, direction, none, impulses, more)
     for i in range(k):
         impulses[i] *= 1.0 + e[i]
     add_rates(rates, coupling, impulses, behind, k)
     find_pattern(k, r, d, rough, mu, coupling, behind, involved, none, second, stuck, direction, more)
-    hold_rows(k, r, d, rough, coupling, second, stuck, row.returned, more)
+    select_rows(k, r, d, rough, coupling, second, stuck, row.returned, more)
     find_impulses(k, r, d, rough, mu, coupling, behind, second, stuck, direction, none, impulses, more)
     add_rates(behind, coupling, impulses, room.targets, k)
     for i in range(k):
@@ -812,7 +814,7 @@ def find_change(scene: Scene, member: Member, hits: bool, row: Entry, room: Room
             for i in range(k):
                 targets[i] = 0.0 if row.ends[i] > 0 else targets[i]
             find_impulses(k, r, d, rough, mu, coupling, rates, push, stuck, direction, targets, impulses, rest)
-    hold_rows(k, r, d, rough, coupling, push, stuck, row.held, rest)
+    select_rows(k, r, d, rough, coupling, push, stuck, row.held, rest)
     for c in range(r):
         stuck[c] = (1.0 - stuck[c]) * push[rough[c]] if hits else 0.0  # from here on those that slide
     add_rates(rates, coupling, impulses, room.apart, size)
@@ -905,7 +907,7 @@ def end_bounces(scene: Scene, member: Member, row: Entry, room: Room) -> bool:
 
 
 @loop
-def stay_closed(scene: Scene, member: Member, hits: bool, room: Room):
+def close_pressing(scene: Scene, member: Member, hits: bool, room: Room):
     """Close the contacts that stay in touch after an impact, and press upon each other there.
 
     Their accelerations decide, without friction; with friction, or where these are zero, later rounds do. All redundant
@@ -945,7 +947,7 @@ def stay_closed(scene: Scene, member: Member, hits: bool, room: Room):
 
 
 @loop
-def rub(scene: Scene, member: Member, first: int, hits: bool, room: Room):
+def decide_sticking(scene: Scene, member: Member, first: int, hits: bool, room: Room):
     """Write which contacts stick after a change, and the directions of those that slide; `CHANGED` marks changes.
 
     Contacts that start to slide move against the force that held them, or along their slip.
@@ -1019,7 +1021,7 @@ def count_doubts(scene: Scene, member: Member, hits: bool, row: Entry, room: Roo
 
 
 @loop
-def move(scene: Scene, member: Member, first: int, meets: Floats, row: Entry, room: Room):
+def apply_change(scene: Scene, member: Member, first: int, meets: Floats, row: Entry, room: Room):
     """Change the state by the change of velocities, where contacts `meets` close; record what rounding leaves.
 
     The gap that closes is set to zero, also for its derivatives: its rounding would grow with each bounce. A number
@@ -1038,7 +1040,7 @@ def move(scene: Scene, member: Member, first: int, meets: Floats, row: Entry, ro
         offset[j] = room.shift[j] if scene.corners > 0 else 0.0
         x[j] += offset[j]
         largest[j] = max(largest[j], abs(x[j]))
-    note_force_noise(scene, member, first, room)
+    record_force_noise(scene, member, first, room)
     for i in range(k):
         if meets[i] > 0 and i < scene.gaps:
             for j in range(n):
@@ -1058,7 +1060,7 @@ def move(scene: Scene, member: Member, first: int, meets: Floats, row: Entry, ro
 
 
 @loop
-def note_force_noise(scene: Scene, member: Member, first: int, room: Room):
+def record_force_noise(scene: Scene, member: Member, first: int, room: Room):
     """Record which forces are zero before a change of velocities, and the rounding that could cause some."""
     n, total, x, longest = scene.n, scene.watches, member.x, member.longest
     values, rates = member.rounding, member.rate_rounding
@@ -1078,8 +1080,8 @@ def note_force_noise(scene: Scene, member: Member, first: int, room: Room):
 
 
 @loop
-def name_change(scene: Scene, first: int, hits: bool, did: Floats, row: Entry, room: Room):
-    """Write the contact of watch `first`, and the kind of its change, into the row."""
+def write_change_name(scene: Scene, first: int, hits: bool, did: Floats, row: Entry, room: Room):
+    """Write into the row which contact changed at watch `first`, and the kind of the change."""
     k, r, rough = scene.k, scene.r, scene.rough
     contact, change = -1, -1
     if first < k:
@@ -1097,13 +1099,13 @@ def name_change(scene: Scene, first: int, hits: bool, did: Floats, row: Entry, r
 
 
 @loop
-def start(scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, room: Room):
+def start_member(scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, room: Room):
     """Initialise a member with outputs at `ts`, including those that lie before its first corner."""
     n, x, first = scene.n, member.x, member.first
     open_all(scene, x, x)
     for i in range(3):
         member.doubted[i] = MISSING
-    member.result = float(begin(scene, member, room))
+    member.result = float(start_contacts(scene, member, room))
     copy(x, member.begun, 2 * n + 1)
     for j in range(scene.times):
         if x[2 * n] > first and ts[j] <= x[2 * n]:

@@ -43,7 +43,7 @@ class ImpactRows(NamedTuple):
         return cls(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))
 
 
-class HeldRows(NamedTuple):
+class ActiveRows(NamedTuple):
     """The contacts in an impact: `rows` (K,) are 1 if held, else 0; `rough` are the r contacts with friction.
 
     Of these, `slides` (r,) is the coefficient of those that slide, else 0, and `direction` (r, d) that of the slip.
@@ -61,7 +61,7 @@ class HeldRows(NamedTuple):
         return len(self.rows) - size + np.arange(size).reshape(self.direction.shape)
 
 
-def find_impulses(rows: ImpactRows, held: HeldRows, targets):
+def find_impulses(rows: ImpactRows, held: ActiveRows, targets):
     """The impulses (K,) that give pushing contacts the rates `targets` (k,), and sticking slips the rate 0.
 
     The impulse of a free row is zero; that of a sliding contact includes its friction.
@@ -82,7 +82,7 @@ def find_impulses(rows: ImpactRows, held: HeldRows, targets):
     return _turn_directions(rows, held, impulses_along)
 
 
-def _turn_directions(rows: ImpactRows, held: HeldRows, impulses_along):
+def _turn_directions(rows: ImpactRows, held: ActiveRows, impulses_along):
     """The impulses (K,) with sliding directions equal to those of the slips after the impact, differentiably.
 
     Two Newton steps from the given directions give derivatives of first and second order.
@@ -115,7 +115,7 @@ def rates_behind(rows: ImpactRows, compressed, returned, restitution):
 
     def phase(rates, held):
         none = jnp.zeros_like(rates)
-        free = HeldRows(held, none[:0], jnp.zeros((0, 1)), np.zeros(0, int))
+        free = ActiveRows(held, none[:0], jnp.zeros((0, 1)), np.zeros(0, int))
         return find_impulses(rows._replace(rates=rates), free, none)
 
     rates = rows.rates + rows.coupling @ ((1.0 + restitution) * phase(rows.rates, compressed))

@@ -40,7 +40,7 @@ def drop_dependent(coupling: Floats, held: Floats, size: int, work: Floats):
 
 
 @loop
-def solve(matrix: Floats, right: Floats, size: int):
+def solve_dense(matrix: Floats, right: Floats, size: int):
     """Overwrite `right` (size,) with the solution of matrix x = right, by elimination with row pivoting."""
     for i in range(size):
         best = i
@@ -66,7 +66,7 @@ def solve(matrix: Floats, right: Floats, size: int):
 
 
 @loop
-def hold_rows(
+def select_rows(
     k: int, r: int, d: int, rough: Wholes, coupling: Floats, push: Floats, sticks: Floats, held: Floats, work: Floats
 ):
     """Write into `held` 1 for the rows with prescribed rates: of contacts that push, and of slips that stick."""
@@ -88,7 +88,7 @@ def mix_friction(k: int, r: int, d: int, rough: Wholes, slides: Floats, directio
 
 
 @loop
-def write_held_system(
+def write_impulse_system(
     k: int, r: int, d: int, rough: Wholes, coupling: Floats, slides: Floats, direction: Floats, held: Floats,
     matrix: Floats
 ):  # fmt: skip
@@ -116,14 +116,14 @@ def find_impulses(
     size, off = k + r * d, 1.0
     held, slides, system = work, work[size:], work[size + r :]
     rest = system[size * size :]
-    hold_rows(k, r, d, rough, coupling, push, sticks, held, system)
+    select_rows(k, r, d, rough, coupling, push, sticks, held, system)
     for c in range(r):
         slides[c] = mu[c] * push[rough[c]] * (1.0 - sticks[c])
     for _ in range(TURNS):
-        write_held_system(k, r, d, rough, coupling, slides, direction, held, system)
+        write_impulse_system(k, r, d, rough, coupling, slides, direction, held, system)
         for i in range(size):
             impulses[i] = held[i] * ((targets[i] if i < k else 0.0) - rates[i])
-        solve(system, impulses, size)
+        solve_dense(system, impulses, size)
         mix_friction(k, r, d, rough, slides, direction, impulses)
         if d == 1 or r == 0 or off <= ALIGNED:
             break
@@ -154,8 +154,8 @@ def turn_directions(
             for x in range(2):
                 turned = along[2 * j + 1] if x == 0 else -along[2 * j]
                 moved[i] -= held[i] * coupling[i * size + k + 2 * j + x] * slides[j] * turned * impulses[rough[j]]
-        write_held_system(k, r, 2, rough, coupling, slides, along, held, system)
-        solve(system, moved, size)
+        write_impulse_system(k, r, 2, rough, coupling, slides, along, held, system)
+        solve_dense(system, moved, size)
         mix_friction(k, r, 2, rough, slides, along, moved)
         for x in range(2):
             turned = along[2 * j + 1] if x == 0 else -along[2 * j]
@@ -172,7 +172,7 @@ def turn_directions(
     for c in range(r):
         if slopes[c * r + c] == 0:
             slopes[c * r + c] = 1.0
-    solve(slopes, across, r)
+    solve_dense(slopes, across, r)
     off = 0.0
     for c in range(r):
         if slides[c] > 0:
@@ -213,7 +213,7 @@ def find_violations(
 
 
 @loop
-def exchange(tableau: Floats, basis: Floats, row: int, enters: int, size: int):
+def pivot_tableau(tableau: Floats, basis: Floats, row: int, enters: int, size: int):
     """Pivot a tableau: column `enters` replaces the basic variable of `row`."""
     width, pivot = 2 * size + 2, tableau[row * (2 * size + 2) + enters]
     for column in range(width):
@@ -227,7 +227,7 @@ def exchange(tableau: Floats, basis: Floats, row: int, enters: int, size: int):
 
 
 @loop
-def complement(matrix: Floats, values: Floats, size: int, chosen: Floats, tableau: Floats):
+def solve_complementarity(matrix: Floats, values: Floats, size: int, chosen: Floats, tableau: Floats):
     """Write into `chosen` (size,) 1 for each z that may be positive in w = values + matrix z, w, z ≥ 0, w ⟂ z.
 
     By Lemke's pivoting: Cottle, Pang & Stone, *The Linear Complementarity Problem* (1992), algorithm 4.4.5.
@@ -247,7 +247,7 @@ def complement(matrix: Floats, values: Floats, size: int, chosen: Floats, tablea
         tableau[i * width + cover + 1] = values[i] / largest
     if not values[lowest] < 0:
         return
-    exchange(tableau, basis, lowest, cover, size)
+    pivot_tableau(tableau, basis, lowest, cover, size)
     enters = lowest + size
     for _ in range(PIVOTS * size):
         row, least = -1, 0.0
@@ -265,7 +265,7 @@ def complement(matrix: Floats, values: Floats, size: int, chosen: Floats, tablea
                 if ratio <= least + SMALL_PIVOT and (row < 0 or basis[i] == cover):
                     row = i
         leaves = int(basis[row])
-        exchange(tableau, basis, row, enters, size)
+        pivot_tableau(tableau, basis, row, enters, size)
         if leaves == cover:
             break
         enters = leaves + size if leaves < size else leaves - size
@@ -308,7 +308,7 @@ def find_pattern_in_plane(
         matrix[(k + c) * size + rows + c] = 1.0
         matrix[(rows + c) * size + rough[c]] = 2.0 * brought
         matrix[(rows + c) * size + k + c] = -1.0
-    complement(matrix, values, size, chosen, tableau)
+    solve_complementarity(matrix, values, size, chosen, tableau)
     for i in range(k):
         push[i] = float(touches[i] > 0 and chosen[i] > 0)
     for c in range(r):
@@ -377,7 +377,7 @@ def find_pattern(
         for i in range(4):
             rest[i] = coupling[i]
         rest[4], rest[5] = -(1.0 + restitution[0]) * rates[0], -rates[1]
-        solve(rest, rest[4:], 2)
+        solve_dense(rest, rest[4:], 2)
         push[0], sticks[0] = 1.0, float(abs(rest[5]) <= mu[0] * rest[4])
         direction[0] = -1.0 if rest[5] > 0 else 1.0
     elif d == 1:

@@ -21,13 +21,13 @@ from lagjax._interface import halves
 from lagjax._primitives import differentiable_where, limit_directions
 from lagjax._run.contacts._contact_search import HELD, POISSON
 from lagjax._run.contacts._impact_derivatives import (
-    HeldRows,
+    ActiveRows,
     ImpactRows,
     construct_impulses,
     find_impulses,
     rates_behind,
 )
-from lagjax._run.jumps import Replay, SceneCode, join
+from lagjax._run.jumps import Replay, SceneCode, concatenate
 
 
 class Played(NamedTuple):
@@ -87,7 +87,7 @@ class ContactReplay(Replay):
 
     def _end_effects(self, given: tuple, record):
         given = (record, *jax.lax.stop_gradient(given[:3]), *given)
-        return self._end_in_parts(*given) if self._watch_line is None else self._watch_line(join(*given))
+        return self._end_in_parts(*given) if self._watch_line is None else self._watch_line(concatenate(*given))
 
     @functools.cached_property
     def _watch_line(self) -> Line | None:
@@ -113,7 +113,7 @@ class ContactReplay(Replay):
         *impact, behind = self._impact_jump((t, y), rows, row, vector, restitution, friction)
         behind, later = jnp.where(decides, behind, y), t + jnp.where(decides, row.later_on, 0.0)
         shared = rows.values[:k], rows.gradients[k:] @ v0
-        return join(jnp.where(smooth, 1.0, 0.0), t, halves(y)[1], *impact, behind, later, *shared)
+        return concatenate(jnp.where(smooth, 1.0, 0.0), t, halves(y)[1], *impact, behind, later, *shared)
 
     def _opened(self, t, y, vector):
         """The inputs of lines at a state, with all contacts open."""
@@ -134,7 +134,7 @@ class ContactReplay(Replay):
         else:
             bounced = -restitution * rows.rates[:k]
         bounced, ends = jnp.where(hits, bounced, 0.0), row.ends > 0
-        held = HeldRows(row.held, row.slides * friction, direction, self._rough)
+        held = ActiveRows(row.held, row.slides * friction, direction, self._rough)
         impulses = find_impulses(rows, held, jnp.where(ends, 0.0, bounced))
         change = impulses @ rows.responses
         own = jnp.sum(jnp.where(np.eye(k) > 0, rows.coupling[:k, :k], 0.0), axis=0)

@@ -33,16 +33,9 @@ from lagjax._interface import (
     require_flag,
     result_from,
 )
-from lagjax._run._trajectory import (
-    RunSettings,
-    Trajectory,
-    follow_in_doubles,
-    follow_in_numbers,
-    raise_unless_ok,
-    step_counts,
-)
+from lagjax._run._trajectory import RunSettings, Trajectory, raise_unless_ok, run_in_doubles, run_single, step_counts
 from lagjax._run.hybrid._mode import Transition
-from lagjax._run.hybrid._transition_motion import HybridPlan, follow_concrete, hybrid_motion
+from lagjax._run.hybrid._transition_motion import HybridPlan, hybrid_motion, integrate_concrete
 from lagjax._run.hybrid._transition_search import IN_ONE_PLACE
 from lagjax._run.jumps import tolerances_of
 from lagjax._scene import System, present_system, require_system
@@ -138,7 +131,7 @@ class Hybrid:
         _require_modes(self.modes, self.transitions, self.start, self.max_transitions)
 
 
-def follow_modes(
+def simulate_modes(
     scene: Hybrid, q0: PyTree, qdot0: PyTree, ts, params: PyTree, rtol, atol, max_steps: int, throw: bool
 ) -> Trajectory:
     """The motion of a hybrid scene from (q0, qdot0); the arguments are those of `simulate`."""
@@ -154,9 +147,9 @@ def follow_modes(
     limits = scene.max_transitions, tolerances, problem.is_single
     plan = HybridPlan(tuple(modes), tuple(modes.values()), tuple(scene.transitions), *limits)
     if problem.is_known and is_concrete(start):
-        found = jax.device_put(follow_in_numbers(functools.partial(follow_concrete, plan), problem, start))
+        found = jax.device_put(run_single(functools.partial(integrate_concrete, plan), problem, start))
     else:
-        found = follow_in_doubles(functools.partial(hybrid_motion, plan), problem, start)
+        found = run_in_doubles(functools.partial(hybrid_motion, plan), problem, start)
     known = dataclasses.replace(problem, ts=jax.lax.stop_gradient(problem.ts))
     more = {"max_transitions": scene.max_transitions, "transitions": tuple(scene.transitions)}
     trajectory = Trajectory(
@@ -268,7 +261,7 @@ def require_scene(scene: Any) -> Scene:
     return scene._current_edition() if isinstance(scene, Hybrid) else require_system(scene, contacts=True)
 
 
-def jumps(scene: Any) -> bool:
+def may_jump(scene: Any) -> bool:
     """True if the motion of a scene may jump: a hybrid one, or one with contacts."""
     return isinstance(scene, Hybrid) or scene.touches
 
@@ -282,8 +275,8 @@ def first_law(scene: Scene) -> System:
     """The `System`, or that of the mode in which a `Hybrid` begins: of any mode, if that is traced."""
     if not isinstance(scene, Hybrid):
         return scene
-    return laws(scene)[int(scene.first) if is_concrete(scene.first) else 0]
+    return list_laws(scene)[int(scene.first) if is_concrete(scene.first) else 0]
 
 
-def laws(scene: Scene) -> tuple[System, ...]:
+def list_laws(scene: Scene) -> tuple[System, ...]:
     return tuple(scene.modes.values()) if isinstance(scene, Hybrid) else (scene,)

@@ -57,10 +57,10 @@ def hybrid_motion(plan: HybridPlan, layout: Layout, ts, y0, params: PyTree, star
     replay = replay_of(plan, layout, params, len(ts))
     vector = vector_of(eqx.filter(params, eqx.is_array_like)).astype(float)
     given = ts, y0, vector, jax.lax.stop_gradient(jnp.asarray(start, float))[None]
-    return _arrange_outcome(plan, layout, replay, *replay.follow(*given), given[:3])
+    return _arrange_outcome(plan, layout, replay, *replay.search_and_replay(*given), given[:3])
 
 
-def follow_concrete(plan: HybridPlan, layout: Layout, params: PyTree, ts, y0, vectors, start) -> Ending:
+def integrate_concrete(plan: HybridPlan, layout: Layout, params: PyTree, ts, y0, vectors, start) -> Ending:
     """The motions of N members with concrete numbers: `y0` (N, 2n), `ts` (N or 1, T), `vectors` (N, P).
 
     `params` are those of one member; all begin in mode number `start`.

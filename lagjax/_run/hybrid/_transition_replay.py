@@ -14,7 +14,7 @@ from lagjax._engine.taylor import Line, move_to_zero, run_stretch
 from lagjax._primitives import differentiable_where
 from lagjax._run._trajectory import constant_unless
 from lagjax._run.hybrid._mode import ModeParts
-from lagjax._run.jumps import Replay, SceneCode, join
+from lagjax._run.jumps import Replay, SceneCode, concatenate
 
 
 class PlayedModes(NamedTuple):
@@ -66,7 +66,7 @@ class HybridReplay(Replay):
 
     def _end_effects(self, place: int, given: tuple):
         line = self._line_of(place)
-        return self._end_in_parts(place, *given) if line is None else line(join(*given))
+        return self._end_in_parts(place, *given) if line is None else line(concatenate(*given))
 
     def _make_line(self, place: int) -> Line | None:
         states, numbers = 2 * self.sizes["N"], self.sizes["NUMBERS"]
@@ -89,4 +89,4 @@ class HybridReplay(Replay):
                 taken = (row.decides > 0) & (k == g)
                 at = (jnp.where(taken, *both) for both in zip((t, y, numbers), still, strict=True))
                 behind = jnp.where(taken, reset(*at), behind)
-        return join(jnp.where(smooth, 1.0, 0.0), t, y, behind)
+        return concatenate(jnp.where(smooth, 1.0, 0.0), t, y, behind)

@@ -29,7 +29,7 @@ IN_ONE_PLACE, APART = 8, 1e-9
 # as many blows would settle more cases of restitution below one, whose last blows are small.
 MOST_BLOWS, SAME = 32, 1e-9
 INFINITY, MISSING = float("inf"), float("nan")
-watch, write_times, write_outputs = bind_loops(globals())
+write_watches, write_times, write_outputs = bind_loops(globals())
 
 
 @loop
@@ -39,7 +39,7 @@ def find_mode(scene: Scene, member: Member) -> int:
 
 
 @loop
-def start(scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, room: Room):
+def start_member(scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, room: Room):
     """Initialise a member. A mode number that is no mode, such as −1, comes with a state that was not reached."""
     member.latest = -1.0
     for j in range(scene.k):
@@ -48,11 +48,13 @@ def start(scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, r
     if not (member.mode[0] >= 0 and member.mode[0] < float(scene.modes)):
         member.result = float(NOT_FINITE)
     else:
-        member.result = float(INCONSISTENT if is_off(scene, find_mode(scene, member), member.x, room) else GOING)
+        member.result = float(
+            INCONSISTENT if is_inconsistent(scene, find_mode(scene, member), member.x, room) else GOING
+        )
 
 
 @loop
-def is_off(scene: Scene, mode: int, x: Floats, room: Room) -> bool:
+def is_inconsistent(scene: Scene, mode: int, x: Floats, room: Room) -> bool:
     """True if the state at inputs x violates the constraints of a mode."""
     if scene.checks[mode] == 0:
         return False
@@ -61,13 +63,13 @@ def is_off(scene: Scene, mode: int, x: Floats, room: Room) -> bool:
 
 
 @loop
-def clear(rate: float, rounding: float, largest: float) -> float:
+def zero_rounding(rate: float, rounding: float, largest: float) -> float:
     """The rate, or 0 if it is below its rounding, or below the `largest` rounding so far."""
     return rate if abs(rate) > max(rounding, largest) else 0.0
 
 
 @loop
-def reset(scene: Scene, member: Member, j: int, x: Floats, after: Floats):
+def apply_reset(scene: Scene, member: Member, j: int, x: Floats, after: Floats):
     """Write into `after` the inputs after transition j, from inputs x."""
     copy(x, after, scene.inputs)
     if scene.resets[j] != 0:
@@ -78,11 +80,11 @@ def reset(scene: Scene, member: Member, j: int, x: Floats, after: Floats):
 
 
 @loop
-def prepare(scene: Scene, member: Member, ts: Floats, times: Floats, y: Floats, numbers: Floats, room: Room):
+def prepare_stretch(scene: Scene, member: Member, ts: Floats, times: Floats, y: Floats, numbers: Floats, room: Room):
     """Write the run of a member's next stretch: its times (T + 2,), its start, and its numbers with the sides."""
     mode, x, n = find_mode(scene, member), member.x, scene.n
     count, first = scene.counts[mode], scene.first_of[mode]
-    note_rounding(scene, member, mode, room)
+    record_rounding(scene, member, mode, room)
     for g in range(count):
         write_side(scene, member, mode, g, room)
     copy(x[2 * n + 1 :], numbers, scene.numbers)
@@ -93,7 +95,7 @@ def prepare(scene: Scene, member: Member, ts: Floats, times: Floats, y: Floats, 
 
 
 @loop
-def note_rounding(scene: Scene, member: Member, mode: int, room: Room):
+def record_rounding(scene: Scene, member: Member, mode: int, room: Room):
     """Record the rounding of the guards at the start of a stretch: of its mode, and of other modes.
 
     A guard of another mode may be the same function. Quantities of that mode's equations are left out.
@@ -101,7 +103,7 @@ def note_rounding(scene: Scene, member: Member, mode: int, room: Room):
     for of in range(scene.modes):
         count, first, watches = scene.counts[of], scene.first_of[of], room.other
         if count > 0:
-            watch(scene, member, member.x, of, watches, room.free)
+            write_watches(scene, member, member.x, of, watches, room.free)
         for g in range(count):
             j, value, rate = first + g, watches[2 * count + g], watches[4 * count + g]
             if (of == mode or scene.alike[j] > 0) and isfinite(value):
@@ -117,7 +119,7 @@ def write_side(scene: Scene, member: Member, mode: int, g: int, room: Room):
     """Write the side of guard g where a stretch starts in this mode; for one beyond zero see `Transition`."""
     total, j, guards = scene.counts[mode], scene.first_of[mode] + g, member.guards
     value, way, rounding = guards[g], float(scene.way[j]), member.rounding[j]
-    rate = clear(guards[total + g], guards[4 * total + g], member.rate_rounding[j])
+    rate = zero_rounding(guards[total + g], guards[4 * total + g], member.rate_rounding[j])
     noise, last = rounding + guards[3 * total + g], member.sides[j]
     # It comes from the side where it is; on its surface it can change in its direction, if it has one.
     side = find_sign(value) if abs(value) > noise else -way
@@ -130,7 +132,7 @@ def write_side(scene: Scene, member: Member, mode: int, g: int, room: Room):
     back, is_beyond = scene.target[j] == mode, value * way > noise
     by_target = is_beyond and scene.fires[j] == BY_TARGET
     at_once = (is_beyond and scene.fires[j] == BEYOND) or (by_target and not back)
-    is_blow = by_target and back and turns_round(scene, member, mode, g, rate, room)
+    is_blow = by_target and back and reverses_guard(scene, member, mode, g, rate, room)
     member.came[g] = (-way if is_blow else side) * max(noise, LEAST)
     if at_once:
         member.came[g] = -way * INFINITY
@@ -139,7 +141,7 @@ def write_side(scene: Scene, member: Member, mode: int, g: int, room: Room):
 
 
 @loop
-def turns_round(scene: Scene, member: Member, mode: int, g: int, rate: float, room: Room) -> bool:
+def reverses_guard(scene: Scene, member: Member, mode: int, g: int, rate: float, room: Room) -> bool:
     """True for a guard whose reset keeps it off its surface: it reverses its rate, or puts it back.
 
     A kick after which it continues does not, nor does a section without a reset.
@@ -148,9 +150,9 @@ def turns_round(scene: Scene, member: Member, mode: int, g: int, rate: float, ro
     if scene.resets[j] == 0 or scene.way[j] == 0:
         return False
     way = float(scene.way[j])
-    reset(scene, member, j, member.x, room.after)
-    watch(scene, member, room.after, mode, watches, room.free)
-    later = clear(watches[total + g], watches[4 * total + g], 0.0) * way
+    apply_reset(scene, member, j, member.x, room.after)
+    write_watches(scene, member, room.after, mode, watches, room.free)
+    later = zero_rounding(watches[total + g], watches[4 * total + g], 0.0) * way
     turned = later >= 0 if rate * way < 0 else later <= 0
     return turned or (member.guards[g] - watches[g]) * way > watches[2 * total + g]
 
@@ -159,7 +161,7 @@ def turns_round(scene: Scene, member: Member, mode: int, g: int, rate: float, ro
 
 
 @loop
-def finish(
+def process_stretch(
     scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, record: Entry, found: Floats, y_end: Floats,
     t_end: float, changes: Floats, event: int, result: int, accepted: float, rejected: float, room: Room
 ):  # fmt: skip
@@ -200,7 +202,7 @@ def finish(
     if row.happens > 0:
         member.rounds += 1.0
         if member.rounds >= scene.most:
-            reached = name_end(scene, record, ts[scene.times - 1])
+            reached = find_end_result(scene, record, ts[scene.times - 1])
     member.result = float(reached)
 
 
@@ -216,19 +218,19 @@ def pass_transition(
     j, fell, watched, sound, against = scene.first_of[mode] + k, room.fell, room.watched, True, False
     member.latest = float(j if k >= 0 else -1)
     if total > 0:
-        watch(scene, member, x, mode, watched, room.free)
+        write_watches(scene, member, x, mode, watched, room.free)
     for g in range(total):
         largest = member.rate_rounding[scene.first_of[mode] + g]
-        room.clear[g] = clear(watched[total + g], watched[4 * total + g], largest)
+        room.clear[g] = zero_rounding(watched[total + g], watched[4 * total + g], largest)
         sound = sound and watched[g] == watched[g]
     if k >= 0:
         against = turns and (room.clear[k] < 0 if fell[k] == 2 else room.clear[k] > 0)
-    note_sides(scene, member, mode, room)
+    record_sides(scene, member, mode, room)
     copy(x, after, scene.inputs)
     happens = k >= 0 and not against
     if happens:
-        row.order_matters = float(has_orders(scene, member, mode, room))
-        reset(scene, member, j, x, after)
+        row.order_matters = float(order_matters(scene, member, mode, room))
+        apply_reset(scene, member, j, x, after)
     for i in range(2 * n):
         sound = sound and isfinite(after[i])
     if against:
@@ -236,7 +238,7 @@ def pass_transition(
     if not sound and (happens or result == SUCCESSFUL):  # a reset may give NaN, and a guard that is NaN never fires
         result = NOT_FINITE
     elif happens:
-        result = INCONSISTENT if is_off(scene, scene.target[j], after, room) else GOING
+        result = INCONSISTENT if is_inconsistent(scene, scene.target[j], after, room) else GOING
     if happens:
         row.happens, row.decides, row.number, row.target = 1.0, 1.0, float(scene.number[j]), float(scene.target[j])
         copy(after, x, 2 * n)
@@ -246,7 +248,7 @@ def pass_transition(
 
 
 @loop
-def note_sides(scene: Scene, member: Member, mode: int, room: Room):
+def record_sides(scene: Scene, member: Member, mode: int, room: Room):
     """Record the sides before a reset of the guards of this mode, and their rounding; others are unknown.
 
     Guards that fired: the side they left. Guards on their surface: the side they started on if they have stayed or have
@@ -271,7 +273,7 @@ def note_sides(scene: Scene, member: Member, mode: int, room: Room):
 
 
 @loop
-def has_orders(scene: Scene, member: Member, mode: int, room: Room) -> bool:
+def order_matters(scene: Scene, member: Member, mode: int, room: Room) -> bool:
     """True if the guards at zero have blows whose result differs when the list is applied in reverse order.
 
     Blows are transitions into their own mode, with a direction and a reset.
@@ -286,8 +288,8 @@ def has_orders(scene: Scene, member: Member, mode: int, room: Room) -> bool:
         return False
     for i in range(2 * scene.n):
         room.largest[i] = abs(member.x[i])
-    follow_blows(scene, member, mode, False, room.one, room)
-    follow_blows(scene, member, mode, True, room.after, room)
+    apply_blows(scene, member, mode, False, room.one, room)
+    apply_blows(scene, member, mode, True, room.after, room)
     for i in range(2 * scene.n):
         if abs(room.one[i] - room.after[i]) > SAME * room.largest[i]:
             return True
@@ -295,7 +297,7 @@ def has_orders(scene: Scene, member: Member, mode: int, room: Room) -> bool:
 
 
 @loop
-def follow_blows(scene: Scene, member: Member, mode: int, backwards: bool, x: Floats, room: Room):
+def apply_blows(scene: Scene, member: Member, mode: int, backwards: bool, x: Floats, room: Room):
     """Apply the blows of the guards at zero to the inputs x, each while its guard still moves in its direction.
 
     Each is applied at least once.
@@ -315,9 +317,9 @@ def follow_blows(scene: Scene, member: Member, mode: int, backwards: bool, x: Fl
         copy(x, room.free, scene.inputs)
         evaluate(scene.resets[first + k], room.free, x)
         armed[k] = 0.0
-        watch(scene, member, x, mode, watches, room.free)
+        write_watches(scene, member, x, mode, watches, room.free)
         for g in range(total):
-            rate = clear(watches[total + g], watches[4 * total + g], 0.0)
+            rate = zero_rounding(watches[total + g], watches[4 * total + g], 0.0)
             goes[g] = float(room.there[g] > 0 and rate * float(scene.way[first + g]) > 0)
             armed[g] = max(armed[g], 1.0 - goes[g])
         for i in range(2 * scene.n):
@@ -328,7 +330,7 @@ def follow_blows(scene: Scene, member: Member, mode: int, backwards: bool, x: Fl
 
 
 @loop
-def name_end(scene: Scene, record: Entry, end: float) -> int:
+def find_end_result(scene: Scene, record: Entry, end: float) -> int:
     """The result of a motion that has used up its budget of transitions before `end`."""
     if repeats_at_instant(scene, record):
         return IN_TURN

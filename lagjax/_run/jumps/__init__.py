@@ -9,10 +9,10 @@ A *law* is the pair of loops and fields that decides what happens at the end of 
 
 from lagjax._run.jumps._driver import GOING, LEAST, bind_law, bind_loops, copy, find_sign
 from lagjax._run.jumps._field_places import Places
-from lagjax._run.jumps._round_replay import Replay, join, mask_rows
+from lagjax._run.jumps._round_replay import Replay, concatenate, mask_rows
 from lagjax._run.jumps._scene_code import Found, JumpLaw, Mode, SceneCode, tolerances_of
 
 __all__ = [
-    "GOING", "LEAST", "Found", "JumpLaw", "Mode", "Places", "Replay", "SceneCode", "bind_law", "bind_loops", "copy",
-    "find_sign", "join", "mask_rows", "tolerances_of",
+    "GOING", "LEAST", "Found", "JumpLaw", "Mode", "Places", "Replay", "SceneCode", "bind_law", "bind_loops",
+    "concatenate", "copy", "find_sign", "mask_rows", "tolerances_of",
 ]  # fmt: skip

@@ -1,11 +1,11 @@
 """The loops of every search, for any law: members side by side, stretch by stretch.
 
-    follow ─► start ─► prepare: sides and rounding of all watches ─► the kernel ─► finish: the event, a row
-                          ▲                                                           │
-                          └───────────────────────────────────────────────────────────┘
+    integrate_members ─► start_member ─► prepare_stretch ─► the kernel ─► process_stretch: the event, a row
+                                               ▲                                │
+                                               └────────────────────────────────┘
 
-A law declares its fields, and provides the loops `start`, `prepare`, `finish` and `find_mode` (`bind_law`). A flag is 0
-or 1. `work` is scratch memory.
+A law declares its fields, and provides the loops `start_member`, `prepare_stretch` (sides and rounding of all watches),
+`process_stretch` and `find_mode` (`bind_law`). A flag is 0 or 1. `work` is scratch memory.
 """
 
 from math import isfinite
@@ -18,7 +18,7 @@ Scene: TypeAlias = Any  # this and the names that follow are what a law gives
 Member: TypeAlias = Any
 Entry: TypeAlias = Any
 Room: TypeAlias = Any
-start = prepare = finish = find_mode = cast(Any, None)
+start_member = prepare_stretch = process_stretch = find_mode = cast(Any, None)
 
 # Results while a motion is followed, when the kernel did not finish its stretch, and before it begins.
 GOING, ASKS, NEW = -1, -2, -3
@@ -39,7 +39,7 @@ def find_sign(x: float) -> float:
 
 
 @loop
-def watch(scene: Scene, member: Member, x: Floats, mode: int, out: Floats, work: Floats):
+def write_watches(scene: Scene, member: Member, x: Floats, mode: int, out: Floats, work: Floats):
     """Write the watches at inputs x, G each: values, rates, roundings of a value, of it by time, and of a rate."""
     n, total = scene.n, scene.counts[mode]
     evaluate(scene.watch[mode], x, work)
@@ -90,7 +90,7 @@ def write_outputs(
 
 
 @loop
-def follow(
+def integrate_members(
     scene: Scene, members: int, ts: Floats, path: Floats, did: Floats, record: Entry, memory: Member, room: Room
 ):
     """Integrate members to their ends, or to a stretch that the kernel does not finish (`ASKS`).
@@ -102,7 +102,7 @@ def follow(
     for m in range(members):
         if memory[m * size :].result == NEW:
             ours = did[m * times * scene.doing :]
-            start(scene, memory[m * size :], ts[m * scene.stride :], path[m * times * states :], ours, room)
+            start_member(scene, memory[m * size :], ts[m * scene.stride :], path[m * times * states :], ours, room)
     while True:
         any_going = False
         for mode in range(scene.modes):
@@ -116,13 +116,13 @@ def follow(
                     count += 1
             if count > 0:
                 any_going = True
-                follow_stretch(scene, mode, count, ts, path, did, record, memory, room)
+                integrate_stretch(scene, mode, count, ts, path, did, record, memory, room)
         if not any_going:
             return
 
 
 @loop
-def follow_stretch(
+def integrate_stretch(
     scene: Scene, mode: int, count: int, ts: Floats, path: Floats, did: Floats, record: Entry, memory: Member,
     room: Room
 ):  # fmt: skip
@@ -141,7 +141,7 @@ def follow_stretch(
         m = int(places[i])
         mine, code[i] = memory[m * size :], -1.0  # until it has ended
         if plan != 0:
-            prepare(
+            prepare_stretch(
                 scene, mine, ts[m * scene.stride :], job[i * outputs :], given_y[i * states :],
                 given_numbers[i * numbers :], room
             )  # fmt: skip
@@ -162,7 +162,7 @@ def follow_stretch(
         if not sound:
             mine.result = float(ASKS)
         else:
-            finish(
+            process_stretch(
                 scene, mine, ts[m * scene.stride :], path[m * times * states :], did[m * times * scene.doing :],
                 record[m * each :], found[i * outputs * states :], y_end[i * states :], t_end[i],
                 fell[i * scene.counts[mode] :], int(result == EVENT), SUCCESSFUL, steps[i], rejected[i], room
@@ -170,14 +170,14 @@ def follow_stretch(
 
 
 def bind_loops(names: dict[str, Any]) -> tuple[Loop, ...]:
-    """The loops `watch`, `write_times` and `write_outputs` for the fields of a law, from its module's `names`."""
+    """`write_watches`, `write_times` and `write_outputs` for the fields of a law, from its module's `names`."""
     given = {name: names[name] for name in ("Scene", "Member")}
-    return tuple(of.bind(**given) for of in (watch, write_times, write_outputs))
+    return tuple(of.bind(**given) for of in (write_watches, write_times, write_outputs))
 
 
 def bind_law(names: dict[str, Any]) -> tuple[Loop, ...]:
-    """The loops `follow`, `prepare`, `finish` and `find_mode` of a law, from its module's `names`."""
-    known = "Scene", "Member", "Entry", "Room", "__name__", "start", "prepare", "finish", "find_mode"
-    given = {name: names[name] for name in known}
-    whole = follow.bind(**given, follow_stretch=follow_stretch.bind(**given))
-    return whole, names["prepare"], names["finish"], names["find_mode"]
+    """The loops of a law, from its module's `names`: `integrate_members`, and those that it provides but the first."""
+    loops = "start_member", "prepare_stretch", "process_stretch", "find_mode"
+    given = {name: names[name] for name in ("Scene", "Member", "Entry", "Room", "__name__", *loops)}
+    whole = integrate_members.bind(**given, integrate_stretch=integrate_stretch.bind(**given))
+    return whole, *(names[name] for name in loops[1:])

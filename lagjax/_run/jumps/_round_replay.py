@@ -32,7 +32,7 @@ def mask_rows(there, x, inputs: tuple):
     return undefined_unless(there, x, inputs) if inputs else np.where(there, x, np.nan)
 
 
-def join(*arrays):
+def concatenate(*arrays):
     return jnp.concatenate([jnp.ravel(x) for x in arrays])
 
 
@@ -57,7 +57,7 @@ class Replay:
         """The fields of `played`, from the arguments of a search."""
         raise NotImplementedError
 
-    def follow(self, *given) -> tuple[Found, Any, Any]:
+    def search_and_replay(self, *given) -> tuple[Found, Any, Any]:
         """The findings of a search, the rows of its record, and the replayed results, which have derivatives."""
         found = self.code.search(*jax.lax.stop_gradient(given))
         row, played = self.read(found)

@@ -190,7 +190,7 @@ class SceneCode:
         path = np.full((members, self.sizes["TIMES"], states), np.nan)
         did = np.full((members, self.sizes["TIMES"], self.sizes["DOING"]), -1.0)
         run = _BatchRun(self, scene, np.ascontiguousarray(ts), memory, path, did, room)
-        run.follow()
+        run.integrate_members()
         x = memory[:, scene[at["X"]] :]
         ending = [x[:, states : states + 1], x[:, :states]]
         names = *ENDING, *self.law.ending, "BEGUN"
@@ -225,7 +225,7 @@ class _BatchRun:
         scene[at.STRIDE] = ts.shape[1] if len(ts) > 1 else 0
         self.results = memory[:, scene[at.RESULT]]
 
-    def follow(self) -> None:
+    def integrate_members(self) -> None:
         """Integrate all members to their ends."""
         members = len(self.memory)
         together = min(_TOGETHER, max(1, -(-members // cores())))
@@ -233,11 +233,11 @@ class _BatchRun:
         while True:
             self.scene[self.at.ROOM] = self.record.shape[1]
             if len(places) == 1:
-                self._follow_members(places[0])
+                self._integrate_block(places[0])
             else:
                 pool = ThreadPoolExecutor(cores())
                 try:
-                    list(pool.map(self._follow_members, places))
+                    list(pool.map(self._integrate_block, places))
                 finally:  # who is interrupted waits for those that run, and for no others
                     pool.shutdown(cancel_futures=True)
             self._answer_requests(np.flatnonzero(self.results == ASKS).tolist())
@@ -251,7 +251,7 @@ class _BatchRun:
             used = int(self.memory[:, self.scene[self.at.ROWS]].max(initial=1))
             self.record = np.ascontiguousarray(self.record[:, : max(used, 1)])
 
-    def _follow_members(self, members: slice) -> None:
+    def _integrate_block(self, members: slice) -> None:
         scene, memory = self.scene.copy(), self.memory[members]
         outputs, states = scene[self.at.TIMES] + 2, 2 * scene[self.at.N]
         numbers = scene[self.at.INPUTS] - states - 1 + 2 * scene[self.at.WATCHES]

@@ -216,12 +216,10 @@ COMPLEX.update({name: _elementwise(function) for name, function in _FUNCTIONS.it
 COMPLEX.update({name: _partwise(name) for name in _PARTWISE})
 
 
-def _multiply_all(expansion, multiply: Callable, rows: np.ndarray) -> np.ndarray:
-    return functools.reduce(functools.partial(multiply, expansion, {}), rows)
-
-
 COMPLEX["integer_pow"] = lambda of, params, x: _ids_of(of, _whole_power(_pair_of(of, x), params["y"]))
-COMPLEX["reduce_prod"] = reduction(COMPLEX["mul"], 1.0 + 0.0j, _multiply_all)
+COMPLEX["reduce_prod"] = reduction(
+    COMPLEX["mul"], 1.0 + 0.0j, lambda of, multiply, rows: functools.reduce(functools.partial(multiply, of, {}), rows)
+)
 COMPLEX["complex"] = lambda expansion, params, re, im: expansion.pair(*np.broadcast_arrays(re, im))
 
 

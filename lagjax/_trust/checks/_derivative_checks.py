@@ -4,9 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from lagjax._equations import describe_pieces, offenders
+from lagjax._equations import describe_decisions, find_offenders
 from lagjax._interface import join_names
-from lagjax._trust.checks._differences import Slopes, differ, ladder, slopes
+from lagjax._trust.checks._differences import Slopes, slopes, slopes_differ, step_ladder
 from lagjax._trust.checks._findings import Finding
 from lagjax._trust.checks._jumps_near import OF_FORCE
 from lagjax._trust.checks._scene_at_start import CheckedScene
@@ -23,7 +23,11 @@ def findings(scene: CheckedScene) -> list[Finding]:
     if scene.is_large or scene.layout.size > _ALL_AT_ONCE:
         return _compare_along_lines(scene)
     sides = scene.sides()
-    return [found for block in _blocks(scene, sides.round_off) for found in _compare_derivatives(scene, sides, *block)]
+    return [
+        found
+        for block in _compared_derivatives(scene, sides.round_off)
+        for found in _compare_derivatives(scene, sides, *block)
+    ]
 
 
 # ---- finite ----------------------------------------------------------------------------------------------------------
@@ -82,7 +86,7 @@ def _blame_phrase(scene: CheckedScene, role: str, order: str) -> str:
     """Return the end of a sentence: the operation, its operands, its line of code, and what to write instead."""
     wanted = {"value": ("value",), "first": ("value", "first derivative")}.get(order)
     offending = [
-        o for o in offenders(getattr(scene.written_motion, role), *scene.state) if not wanted or o.fault in wanted
+        o for o in find_offenders(getattr(scene.written_motion, role), *scene.state) if not wanted or o.fault in wanted
     ]
     if not offending:
         return ". No single operation is to blame: large numbers may overflow together; look at the units."
@@ -95,7 +99,7 @@ def _blame_phrase(scene: CheckedScene, role: str, order: str) -> str:
 # ---- against finite differences --------------------------------------------------------------------------------------
 
 
-def _blocks(scene: CheckedScene, round_off):
+def _compared_derivatives(scene: CheckedScene, round_off):
     """Return the derivatives to compare: (name, role, derivatives (directions, outputs), directions, outputs).
 
     Directions index the 2n + 1 inputs (q, q̇, t), outputs index `Measured.here`.
@@ -134,8 +138,8 @@ def _compare_derivatives(scene: CheckedScene, sides, name, role, derivative, dir
         sides.minus[chosen], m.here[list(outputs)], sides.plus[chosen], scene.steps[:, list(directions)], place,
         float(np.finfo(dtype).eps), sides.noise[list(outputs)],
     )  # fmt: skip
-    kinks, n = differ(ahead, behind, dtype), scene.layout.size
-    derivative, wrong = derivative.value, differ(derivative, both, dtype) & ~kinks
+    kinks, n = slopes_differ(ahead, behind, dtype), scene.layout.size
+    derivative, wrong = derivative.value, slopes_differ(derivative, both, dtype) & ~kinks
     names = [names[i] for i in directions]
     for i, k in list(zip(*np.nonzero(kinks), strict=True))[:_SHOWN]:
         of_velocity = name == "L" and directions[i] >= n
@@ -150,7 +154,7 @@ def _kink_finding(scene: CheckedScene, name: str, role: str, along: str, values,
     below, above, derivative = values
     slope = f"The slope of {name} along {along} is {below:.6g} below this state and {above:.6g} above it"
     if role in ("lagrangian", "dissipation"):
-        pieces = describe_pieces([getattr(scene.written_motion, role)], scene.state)
+        pieces = describe_decisions([getattr(scene.written_motion, role)], scene.state)
         slope += f" (the function is pieced together by {pieces})" if pieces else ""
     of_force = role == "dissipation" or (role == "lagrangian" and not of_velocity)
     if of_force:
@@ -197,7 +201,7 @@ def _compare_along_lines(scene: CheckedScene) -> list[Finding]:
     directions[-1, -1] = 1.0
     for direction in directions:
         for _ in range(_SHOWN):
-            off = np.flatnonzero(_off_line(scene, direction)[0].any(axis=0)).tolist()
+            off = np.flatnonzero(_compare_line(scene, direction)[0].any(axis=0)).tolist()
             blamed = [(k, i) for k in off if (i := _blamed_coordinate(scene, direction, k)) is not None]
             for k, i in blamed:
                 found = _describe_coordinate(scene, _restrict(direction, i), i, k)
@@ -213,12 +217,12 @@ def _blamed_coordinate(scene: CheckedScene, direction: np.ndarray, k: int) -> in
     part = np.flatnonzero(direction)
     while len(part) > 1:
         halves = part[: len(part) // 2], part[len(part) // 2 :]
-        part = next((of for of in halves if _off_line(scene, _restrict(direction, of))[0][:, k].any()), part[:0])
+        part = next((of for of in halves if _compare_line(scene, _restrict(direction, of))[0][:, k].any()), part[:0])
     return int(part[0]) if len(part) else None
 
 
 def _describe_coordinate(scene: CheckedScene, direction: np.ndarray, i: int, k: int) -> Finding:
-    (kinks, _), both, ahead, behind, derivative = _off_line(scene, direction)
+    (kinks, _), both, ahead, behind, derivative = _compare_line(scene, direction)
     size, along, (name, role) = direction[i], scene.names[i], _OF_LINES[k]
     sides = (behind, ahead) if size > 0 else (ahead, behind)
     values = (*(of.value[0, k] / size for of in sides), derivative[k] / size)
@@ -231,16 +235,16 @@ def _restrict(direction: np.ndarray, part) -> np.ndarray:
     return np.where(np.isin(np.arange(direction.size), part), direction, 0.0)
 
 
-def _off_line(scene: CheckedScene, direction: np.ndarray) -> tuple[np.ndarray, Slopes, Slopes, Slopes, np.ndarray]:
-    """Return flags (2, 5) of kinks and wrong derivatives along a direction; both, one-sided slopes; derivatives."""
+def _compare_line(scene: CheckedScene, direction: np.ndarray) -> tuple[np.ndarray, Slopes, Slopes, Slopes, np.ndarray]:
+    """Return flags (2, 5) of kinks and wrong derivatives along a direction; one-sided slopes; derivatives."""
     n, dtype = scene.layout.size, scene.layout.dtype
-    steps = ladder(np.array([scene.sizes[-1] if direction[-1] else 1.0]), dtype)
+    steps = step_ladder(np.array([scene.sizes[-1] if direction[-1] else 1.0]), dtype)
     line, eps = scene.line(direction, steps[:, 0]), float(np.finfo(dtype).eps)
     place = np.abs(direction) @ (_input_magnitudes(scene) / scene.sizes**2)
     sides = slopes(line.minus[None], line.here, line.plus[None], steps, np.array([place]), eps, 4 * eps * line.terms)
     both, ahead, behind = sides
-    kinks = differ(ahead, behind, dtype)[0]
-    wrong = differ(Slopes(line.derivative[None], 0 * line.derivative[None]), both, dtype)[0] & ~kinks
+    kinks = slopes_differ(ahead, behind, dtype)[0]
+    wrong = slopes_differ(Slopes(line.derivative[None], 0 * line.derivative[None]), both, dtype)[0] & ~kinks
     if direction[:n].any() or direction[-1]:
         kinks[2] = wrong[2] = False  # of D only the slope by velocities counts
     return np.stack([kinks, wrong]), both, ahead, behind, line.derivative

@@ -27,7 +27,7 @@ class Slopes(NamedTuple):
     error: np.ndarray
 
 
-def ladder(size: np.ndarray, dtype) -> np.ndarray:
+def step_ladder(size: np.ndarray, dtype) -> np.ndarray:
     """Return steps (rungs, coordinates) for coordinates of these sizes: from 1/4 down to eps^(2/3) of a size."""
     rungs = int(-np.log2(np.finfo(dtype).eps) * 2 / 3)
     return (size * 0.25 * 2.0 ** -np.arange(rungs)[:, None]).astype(dtype)
@@ -80,7 +80,7 @@ def _agrees_below(estimates: np.ndarray, error: np.ndarray) -> np.ndarray:
     return (value + reach >= lowest) & (value - reach <= highest)
 
 
-def differ(one: Slopes, other: Slopes, dtype) -> np.ndarray:
+def slopes_differ(one: Slopes, other: Slopes, dtype) -> np.ndarray:
     """True where two slopes differ by more than their errors and by more than eps^(1/3) of them."""
     allowed = _SAFETY * (one.error + other.error) + np.finfo(dtype).eps ** (1 / 3) * (abs(one.value) + abs(other.value))
     with np.errstate(invalid="ignore"):

@@ -15,7 +15,7 @@ from lagjax._equations import Derivation, Motion, Sample, Scales, augment, deriv
 from lagjax._interface import Layout, as_arrays
 from lagjax._program import Unlowerable
 from lagjax._scene import System
-from lagjax._trust.checks._differences import ladder
+from lagjax._trust.checks._differences import step_ladder
 
 _NEARBY = 4  # states with different positions, and as many with different velocities
 
@@ -40,7 +40,7 @@ class CheckedScene(NamedTuple):
         here = Sample.from_scene(system, layout, flat[0][None], flat[1][None], flat[2], params)
         scales = _state_scales(here)
         sizes = _input_sizes(q, qdot, scales)
-        steps, offsets = ladder(sizes, layout.dtype), _nearby_offsets(sizes, scales, layout.dtype)
+        steps, offsets = step_ladder(sizes, layout.dtype), _nearby_offsets(sizes, scales, layout.dtype)
         return cls(system, layout, (q, qdot, t, params), state, here, sizes, steps, _measure_states(here, offsets))
 
     @property
@@ -109,7 +109,7 @@ class CheckedScene(NamedTuple):
         return self.derivation.form.is_sparse
 
     def line(self, direction: np.ndarray, steps: np.ndarray) -> "LineValues":
-        """Evaluate the scene along a `direction` (2n + 1,) of the coordinates, the velocities and the motion."""
+        """Return the scene's quantities at `steps` along a `direction` (2n + 1,): q, q̇ and the motion."""
         n, m, here = self.layout.size, self.measured, self.point
         moved = direction + direction[-1] * np.concatenate([here[n:-1], np.zeros(n + 1)])
         q, qdot, t, params = self.arguments

@@ -36,7 +36,7 @@ from jaxtyping import Array, Bool, Float, Int
 from lagjax._interface import RESULTS, Layout, advice, is_concrete, name_of, show_str
 from lagjax._run import Members
 from lagjax._scene import System
-from lagjax._trust._diagnosis import diagnosis, motion_end
+from lagjax._trust._diagnosis import diagnose, motion_end
 from lagjax._trust.health._border_counts import BorderCounts, count_borders, is_piecewise
 from lagjax._trust.health._global_error import global_error
 from lagjax._trust.health._measurements import SLACK, SMALLEST, VISIBLE, Extreme, does_work, measure_trajectory
@@ -54,7 +54,7 @@ def examine(trajectory, reference=None) -> "Health":
         impacts = trajectory.impacts.count, jnp.nansum(trajectory.impacts.energy_lost, axis=-1), *shared
         doubts = trajectory.contact_changes.doubts, trajectory.contact_changes.doubted
         fields["energy_allowed"] = jnp.full_like(jnp.asarray(fields["energy_allowed"]), jnp.inf)
-    located, counts = _borders(trajectory)
+    located, counts = _count_batch_borders(trajectory)
     changes = trajectory.transitions
     guards = changes and (changes.order_matters.any(-1), jnp.isfinite(changes.let_out).any(-1))
     return Health(
@@ -87,7 +87,7 @@ def _first_diagnosis(trajectory) -> str:
     which = tuple(failed[0].tolist())
     layout, row = members.layout, int(np.ravel_multi_index(which, members.batch)) if which else 0
     ended = motion_end(trajectory, layout, which, members.numbers_of(row).astype(layout.dtype))
-    return diagnosis(trajectory.system, layout, members.params_of(row), ended).strip()
+    return diagnose(trajectory.system, layout, members.params_of(row), ended).strip()
 
 
 def _shared_impacts(trajectory) -> tuple:
@@ -100,8 +100,8 @@ def _shared_impacts(trajectory) -> tuple:
     return jnp.sum(shared, axis=-1), jnp.nanmin(jnp.where(shared, t, jnp.nan), axis=-1)
 
 
-def _borders(trajectory) -> tuple[bool, BorderCounts | None]:
-    """Return `count_borders` with the batch axes of the trajectory; None for a piecewise scene that is traced."""
+def _count_batch_borders(trajectory) -> tuple[bool, BorderCounts | None]:
+    """Return `count_borders` with the batch axes of the trajectory; None for a traced piecewise scene."""
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
         members = Members(trajectory)
         located, counts = count_borders(members)

@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._engine import Problem
-from lagjax._engine.taylor import Flow, Tolerances, flow_of, portions
-from lagjax._equations import derivation_of, pieces_of_motion
+from lagjax._engine.taylor import Flow, Tolerances, flow_of, split_portions
+from lagjax._equations import derivation_of, list_decisions
 from lagjax._interface import Layout
-from lagjax._native import Crossed
+from lagjax._native import BorderKind
 from lagjax._program import Unlowerable
 from lagjax._run import Members
 from lagjax._scene import System
-from lagjax._trust.health._measurements import path_of
+from lagjax._trust.health._measurements import sampled_path
 
 LARGEST_COUNTED = 2**22  # numbers of steps that are written down at once
 
@@ -41,7 +41,7 @@ def count_borders(members: Members) -> tuple[bool, BorderCounts | None]:
         return True, nothing
     if trajectory.engine != "MachineCode" or trajectory.tolerances is None:
         return False, None
-    path = path_of(members)
+    path = sampled_path(members)
     start = np.concatenate([path.q[:, 0], path.qdot[:, 0]], axis=1)
     ts = np.stack([path.ts[:, 0], members.shared(trajectory.end.t, 0)], axis=1)
     steps = members.shared(trajectory.stats["num_steps"], 0)
@@ -53,7 +53,7 @@ def count_borders(members: Members) -> tuple[bool, BorderCounts | None]:
     columns = [np.broadcast_to(x, members.count) for x in members.numbers]
     params = np.stack(columns, axis=1) if columns else np.zeros((members.count, 0))
     moved = np.flatnonzero(np.isfinite(start).all(axis=1) & (ts[:, 1] != ts[:, 0]) & (steps > 0))
-    for some in portions(moved, steps * (flow.states + 5 + len(flow.kernel.borders.switches)), LARGEST_COUNTED):
+    for some in split_portions(moved, steps * (flow.states + 5 + len(flow.kernel.borders.switches)), LARGEST_COUNTED):
         tolerances = Tolerances(rtol, atol, 2 * int(steps[some].max()) + 100)
         _count_contacts(flow, ts[some], start[some], params[some], tolerances, steps[some], some, nothing)
     return True, nothing
@@ -65,7 +65,7 @@ def is_piecewise(system: System, layout: Layout, params) -> bool:
     try:
         return derivation.borders is not None and bool(derivation.borders.switches)
     except Unlowerable:  # arrays; as `_explanation` asks
-        return bool(pieces_of_motion(derivation.motion, *derivation.state_shapes))
+        return bool(list_decisions(derivation.motion.functions, *derivation.state_shapes))
 
 
 def _count_contacts(flow: Flow, ts, y0, params, tolerances: Tolerances, steps, places, into: BorderCounts) -> None:
@@ -76,13 +76,13 @@ def _count_contacts(flow: Flow, ts, y0, params, tolerances: Tolerances, steps, p
     # The time reaches entries of tables, too, which are no borders.
     enters, leaves = (np.array([getattr(guard, name) >= 0 for guard in guards] + [False]) for name in ("slide", "on"))
     slides = sorted({guard.slide for guard in guards if guard.slide >= 0})
-    for run in flow.follow(ts, y0, params, tolerances, 2 * int(steps.sum()) + len(places))[1]:
+    for run in flow.run_and_record(ts, y0, params, tolerances, 2 * int(steps.sum()) + len(places))[1]:
         for row, table in run.split_members():
             place, (crossed, number), grazes = places[row], table[:, -3:-1].astype(int).T, table[:, -1] > 0
             along = table[:, flow.states + 4 : flow.states + 4 + pieces][:, slides] > 0.5
             begins = along & ~np.vstack([np.zeros((1, len(slides)), bool), along[:-1]])
-            number = np.where(crossed == Crossed.GUARD, number, len(guards))
-            at_border = (crossed == Crossed.GUARD) & ~leaves[number]
+            number = np.where(crossed == BorderKind.GUARD, number, len(guards))
+            at_border = (crossed == BorderKind.GUARD) & ~leaves[number]
             # A border that the motion slides along from there on has not been crossed.
             to_slide = np.append(np.any(begins, axis=1)[1:], False) & enters[number]
             into.slid[place] += int(begins.sum())

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._interface import is_concrete
-from lagjax._trust.health._measurements import Extreme, extreme
+from lagjax._trust.health._measurements import Extreme, find_extreme
 
 # The largest rtol of a reference, over that of the trajectory: its error is then a tenth of what it measures. With a
 # fifth, an error estimate could be off by a quarter.
@@ -71,4 +71,4 @@ def _global_error(states, reference, ts, floor) -> Extreme:
     both = jnp.isfinite(states).all(axis=-1) & jnp.isfinite(reference).all(axis=-1)
     size = jnp.max(jnp.where(both[..., None], jnp.abs(reference), 0.0), axis=-2, keepdims=True) + floor
     error = jnp.max(jnp.abs(states - reference) / size, axis=-1)
-    return extreme(jnp, error.ndim - 1, jnp.broadcast_to(ts, error.shape), error, both)
+    return find_extreme(jnp, error.ndim - 1, jnp.broadcast_to(ts, error.shape), error, both)

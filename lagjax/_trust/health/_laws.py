@@ -86,7 +86,7 @@ class Law(NamedTuple):
 
         return sample.evaluate_in_parts(measure_part, self._portion(_QUANTITIES), *tolerances)
 
-    def powers(self, sample: Sample) -> np.ndarray:
+    def energy_rates(self, sample: Sample) -> np.ndarray:
         """Return dh/dt at S states, (S,)."""
         names = (*_SOURCES, *(SADDLE if self.motion.constrained else ()))
         return sample.evaluate_in_parts(

@@ -73,7 +73,7 @@ class SampledPath(NamedTuple):
 def measure_trajectory(trajectory) -> dict[str, Any]:
     """Return the fields of `Health` that are computed from the states, and the names that go with them."""
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
-        if (report := _report_in_doubles(Members(trajectory))) is not None:
+        if (report := _measure_in_doubles(Members(trajectory))) is not None:
             return report
     axes, tree = jax.tree.flatten(trajectory.params_axes, is_leaf=lambda axis: axis is None)  # hashable
     arrays = dataclasses.replace(trajectory, stats={}, params_axes=None)
@@ -81,13 +81,13 @@ def measure_trajectory(trajectory) -> dict[str, Any]:
 
 
 @with_doubles
-def _report_in_doubles(members: Members) -> dict[str, Any] | None:
+def _measure_in_doubles(members: Members) -> dict[str, Any] | None:
     """Return the fields of `Health` of all members in float64; None if a scene has no scalar programs."""
     layout = dataclasses.replace(members.layout, dtype=DOUBLE)
     laws = _mode_laws(members.trajectory, layout, widen(members.params))
     if not all(law.derivation.is_lowered for law in laws):
         return None
-    return _report_of(members, laws) | _known_fields(laws, layout)
+    return _measure_concrete(members, laws) | _known_fields(laws, layout)
 
 
 def _precision_of(trajectory, q) -> np.dtype:
@@ -108,7 +108,7 @@ def does_work(trajectory) -> bool:
 
 
 def _known_fields(laws: list[Law], layout: Layout) -> dict[str, Any]:
-    """Return the fields of `Health` that do not depend on the motion, none of them an array."""
+    """Return the fields of `Health` that follow from the scene alone."""
     momenta = _common_conserved(laws)
     return {
         "works": any(law.works for law in laws),
@@ -126,7 +126,7 @@ def _common_conserved(laws: list[Law]) -> tuple[int, ...] | None:
 # ---- in NumPy, all members at once -----------------------------------------------------------------------------------
 
 
-def path_of(members: Members) -> SampledPath:
+def sampled_path(members: Members) -> SampledPath:
     run, ts = members.trajectory, members.shared(members.trajectory.ts, 1)
     transitions = None
     if run.transitions is not None:
@@ -139,9 +139,9 @@ def path_of(members: Members) -> SampledPath:
     return _join_states(np, outputs, transitions, steps, tolerances, precision)
 
 
-def _report_of(members: Members, laws: list[Law]) -> dict[str, Any]:
+def _measure_concrete(members: Members, laws: list[Law]) -> dict[str, Any]:
     """Return the measured fields of `Health`, with the batch axes of the trajectory."""
-    path, momenta = path_of(members), _common_conserved(laws) or ()
+    path, momenta = sampled_path(members), _common_conserved(laws) or ()
 
     def evaluate_by_mode(function: Callable, q, qdot, t, mode):
         """Evaluate `function(law, index, member, sample)` on the states of each mode; return (N, S, …)."""
@@ -175,8 +175,8 @@ def _report_of(members: Members, laws: list[Law]) -> dict[str, Any]:
     with np.errstate(all="ignore"):
         decides = any(borders_of(law.derivation) is not None for law in laws)
         decided = evaluate_law(lambda law, sample: sample.pieces()) if decides else None
-        between = Rates(evaluate_law(Law.powers), evaluate_law(Law.accelerations), decided)
-        fields = _report(path, laws, momenta, partial(evaluate_by_mode, measure_sample), between)
+        between = Rates(evaluate_law(Law.energy_rates), evaluate_law(Law.accelerations), decided)
+        fields = _measure(path, laws, momenta, partial(evaluate_by_mode, measure_sample), between)
     return jax.tree.map(lambda x: jnp.asarray(np.reshape(x, members.batch + np.shape(x)[1:])), fields)
 
 
@@ -208,7 +208,7 @@ def _measure_traced(trajectory, axes, tree, steps):
             evaluate_in_chunks(lambda law, *state: law.power_at(*state, numbers)),
             evaluate_in_chunks(lambda law, *state: law.motion.acceleration(*state, numbers)),
         )
-        return _report(path, laws, momenta, sample, between)
+        return _measure(path, laws, momenta, sample, between)
 
     return trajectory.map_members(one, steps, trajectory.transitions) | names
 
@@ -256,7 +256,7 @@ def _pad_constraints(measured: Measurements, laws: list[Law], index: int) -> Mea
     return measured._replace(distances=pad(measured.distances), rates=pad(measured.rates))
 
 
-def _report(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample: Callable, between: "Rates") -> dict:
+def _measure(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample: Callable, between: "Rates") -> dict:
     """Return all measured fields; `sample(q, qdot, t, mode)` returns the `Measurements` at states."""
     xp, axis, T, dtype = path.library, path.time, path.ts.shape[-1], path.q.dtype
     q, qdot, t, mode = path[:4]
@@ -267,7 +267,7 @@ def _report(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample
     samples = sample(q, qdot, path.t, xp.maximum(mode, 0))
     drifts, work_error = _drifts(path, laws, momenta, samples, reached, between)
     here = jax.tree.map(lambda leaf: leaf[(slice(None),) * axis + (slice(T),)], samples)
-    on_path, most = reached[..., :T], partial(extreme, xp, axis, path.ts)
+    on_path, most = reached[..., :T], partial(find_extreme, xp, axis, path.ts)
     limits, size = _drift_limits(path, here, on_path)
     owner = np.repeat(np.arange(len(laws)), [len(law.names) for law in laws])
     in_force = on_path[..., None] & (mode[..., :T, None] == owner)
@@ -473,7 +473,7 @@ def _drift_limits(path: SampledPath, here: Measurements, on_path) -> tuple[Any, 
     return allowed + ROUND_OFF * float(np.finfo(size.dtype).eps) * (1 + xp.sqrt(steps)) * size, size
 
 
-def extreme(xp, axis: int, ts, values, at, largest: bool = True) -> Extreme:
+def find_extreme(xp, axis: int, ts, values, at, largest: bool = True) -> Extreme:
     """Return the extreme of `values` along the time axis where `at` is True; NaN counts as most extreme."""
     extra = (1,) * (values.ndim - ts.ndim)
     at = xp.broadcast_to(at.reshape(at.shape + (1,) * (values.ndim - at.ndim)), values.shape)
