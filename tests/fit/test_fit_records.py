@@ -8,7 +8,7 @@ import pytest
 import lagjax
 from lagjax import per_record
 from lagjax._fit.model._parameters import Unknowns
-from lagjax._fit.model._residuals import compress_rows
+from lagjax._fit.model._residuals import Point, compress_rows
 from lagjax._fit.result._information import eliminate_starts, parameter_rows
 from lagjax._fit.search import _descent
 
@@ -330,3 +330,24 @@ def test_numbers_of_records_are_eliminated_one_record_after_the_other():
     rows = parameter_rows(triangles, 2, unknowns)
     assert len(rows) == 3 * 2 + 2
     np.testing.assert_allclose(rows.T @ rows, whole.T @ whole, atol=1e-12)
+
+
+def test_a_trial_in_two_parts_is_that_at_once_and_one_of_some_records_is_a_part_of_it():
+    """Motions first, derivatives then; records of several lengths, whose batches differ where one is left out."""
+    records = []
+    for k, end in enumerate((9.0, 5.0, 3.0)):
+        ts = np.arange(0.0, end, 0.05)
+        records.append(lagjax.Record(ts, np.cos(1.2 * ts + k)))
+    fit = lagjax.fit(SPRING, records, {"k": 1.4})
+    residuals, whole = fit.residual_function, fit.residual_function.evaluate(Point(fit.u, fit.states))
+    bare = residuals.evaluate(whole.point, slopes=False)
+    for begun in (bare, residuals.evaluate(whole.point, begun=bare)):
+        for name in ("residuals", "slopes")[: 1 + bool(begun.slopes)]:
+            for found, right in zip(getattr(begun, name), getattr(whole, name), strict=True):
+                np.testing.assert_array_equal(found, right)
+    assert not bare.slopes
+    for keep in (np.array([False, True, True]), np.array([True, False, True])):
+        part, some = residuals.select(keep, whole)
+        for name in ("residuals", "slopes"):
+            for found, right in zip(getattr(some, name), getattr(part.evaluate(some.point), name), strict=True):
+                np.testing.assert_allclose(found, right, atol=1e-9)
