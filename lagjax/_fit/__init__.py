@@ -122,8 +122,9 @@ def fit(
       whole records first, and where these leave motion, long ones by segments, each from its likeliest mode. Where
       signals are no positions and all starts are known, a search that leaves more than a twentieth of the signals is
       tried again from the first samples of the records, and the likelier of both is taken. Of hundreds of records an
-      even sample is searched before all of them. "gradient" descends by reverse-mode gradients with optax's Adam: for scenes with neural terms, an `equinox.nn.MLP` in `params0` for instance. With
-      more than a hundred free numbers the other methods say in a warning that this one is meant for them.
+      even sample is searched before all of them. "gradient" descends by reverse-mode gradients with optax's Adam: for
+      scenes with neural terms, an `equinox.nn.MLP` in `params0` for instance. With more than a hundred free numbers the
+      other methods say in a warning that this one is meant for them.
 
     Of a law of candidate terms (`lagjax.terms`) in `params0` those are 0 that the motion does not ask for.
     Intervals take the correlation of residuals into account (`Fit.noise`). `Fit.unseen` says in words which parameters
