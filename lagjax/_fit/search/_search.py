@@ -191,7 +191,10 @@ class Search:
         anchor = Anchor(point.u, np.where(np.isfinite(reach), 1.0 / _LOOSE, 0.0))
         begun = self._fit_shortest_segments(point, anchor)
         if begun.misfit > 0.0:  # the shortest segments were not fitted from here
-            again = self._fit_shortest_segments(point._replace(u=self._fit_short_windows(point.u, anchor)), anchor)
+            if self.jumping.all():  # with fewer jumps in each
+                again = self._fit_shortest_segments(point, anchor, 0.5)
+            else:
+                again = self._fit_shortest_segments(point._replace(u=self._fit_short_windows(point.u, anchor)), anchor)
             begun = min(begun, again, key=lambda one: one.misfit)
         u, best, levels_done = begun.u, begun.best, [] if begun.first is None else [begun.first]
         for pieces in begun.cuts[1:]:
@@ -205,10 +208,10 @@ class Search:
                 break
         return Point(u, np.stack([best[k, 0] for k in range(len(self.residuals.records))])), levels_done
 
-    def _fit_shortest_segments(self, point: Point, anchor: Anchor) -> "_ShortestSegments":
+    def _fit_shortest_segments(self, point: Point, anchor: Anchor, length: float = 1.0) -> "_ShortestSegments":
         """The search on the shortest segments. Misfit: the mean log of noise over the larger of `_POOR` times the
         data's scatter and `_COARSE` of the signals; positive where they were not fitted."""
-        u, cuts = point.u, self._cut_records(point.u)
+        u, cuts = point.u, self._cut_records(point.u, length)
         best = {(k, 0): start for k, start in enumerate(point.starts)}
         if not cuts:
             return _ShortestSegments(u, cuts, best, -np.inf)
@@ -271,9 +274,9 @@ class Search:
             found.append(min(time_scales(list(reading.values()), part.motions, numbers)) if reading else np.inf)
         return found
 
-    def _cut_records(self, u) -> list[list[Piece]]:
+    def _cut_records(self, u, length: float = 1.0) -> list[list[Piece]]:
         pairs = zip(self.residuals.parts, self._time_scales(u), strict=True)
-        scales = [scale for part, scale in pairs for _ in part.records]
+        scales = [length * scale for part, scale in pairs for _ in part.records]
         modes = [piece.mode for piece in self.residuals.pieces]
         return _levels(self.readers, scales, self.jumping, modes)
 
