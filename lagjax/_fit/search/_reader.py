@@ -47,7 +47,7 @@ class Reader(NamedTuple):
 
     @property
     def noise(self) -> np.ndarray:
-        """How far states may be off, (2n,): those of cubics within their windows."""
+        """The noise of states that were read, (2n,), at its widest: that of cubics within their windows."""
         scatter, windows, step = np.array(self.scatter), np.array(self.windows), np.median(np.diff(self.record.ts))
         return _SURELY * np.concatenate([scatter, scatter * np.sqrt(75.0 / windows**3) / step])
 

@@ -199,7 +199,11 @@ class Search:
         begun = self._fit_shortest_segments(point, anchor)
         for held in (anchor, anchor._replace(weight=np.zeros(len(point.u)))):
             if begun.misfit > 0.0:  # the shortest segments were not fitted from here
-                again = self._fit_shortest_segments(point._replace(u=self._fit_short_windows(point.u, held)), held)
+                if self.jumping.all():  # with fewer jumps in each
+                    again = self._fit_shortest_segments(point, held, 0.5)
+                else:
+                    windowed = point._replace(u=self._fit_short_windows(point.u, held))
+                    again = self._fit_shortest_segments(windowed, held)
                 begun, anchor = min((begun, anchor), (again, held), key=lambda one: one[0].misfit)
         u, best, levels_done = begun.u, begun.best, [] if begun.first is None else [begun.first]
         for pieces in begun.cuts[1:]:
@@ -213,10 +217,10 @@ class Search:
                 break
         return Point(u, np.stack([best[k, 0] for k in range(len(self.residuals.records))])), levels_done
 
-    def _fit_shortest_segments(self, point: Point, anchor: Anchor) -> "_ShortestSegments":
+    def _fit_shortest_segments(self, point: Point, anchor: Anchor, length: float = 1.0) -> "_ShortestSegments":
         """The search on the shortest segments. Misfit: the mean log of noise over the larger of `_POOR` times the
         data's scatter and `_COARSE` of the signals; positive where they were not fitted."""
-        u, cuts = point.u, self._cut_records(point.u)
+        u, cuts = point.u, self._cut_records(point.u, length)
         best = {(k, 0): start for k, start in enumerate(point.starts)}
         if not cuts:
             return _ShortestSegments(u, cuts, best, -np.inf)
@@ -280,9 +284,9 @@ class Search:
             found.append(min(time_scales(list(reading.values()), part.motions, numbers)) if reading else np.inf)
         return found
 
-    def _cut_records(self, u) -> list[list[Piece]]:
+    def _cut_records(self, u, length: float = 1.0) -> list[list[Piece]]:
         pairs = zip(self.residuals.parts, self._time_scales(u), strict=True)
-        scales = [scale for part, scale in pairs for _ in part.records]
+        scales = [length * scale for part, scale in pairs for _ in part.records]
         modes = [piece.mode for piece in self.residuals.pieces]
         return _growing_cuts(self.readers, scales, self.jumping, modes)
 
