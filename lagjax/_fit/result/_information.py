@@ -203,7 +203,7 @@ def null_space(
 def _is_regular(rows: np.ndarray) -> bool:
     """True if a square matrix (F, F) has no singular value near those that count as null, told by its inverse."""
     if rows.shape[0] == rows.shape[1]:
-        with contextlib.suppress(np.linalg.LinAlgError):
+        with contextlib.suppress(np.linalg.LinAlgError), np.errstate(over="ignore", invalid="ignore"):
             return bool(_FAR / np.linalg.norm(np.linalg.inv(rows)) > NULL * max(1.0, np.linalg.norm(rows)))
     return False
 

@@ -38,7 +38,10 @@ _NEAR = 1e-3  # per sample: where it pays to look at how much the residuals are 
 _NEARBY, _MOST_BEND = 0.1, 0.375
 _TAKEN_BACK = 8  # trials of a search: of that many in turn the last step is 2⁻³⁶ as long as the first
 _FLAT = 1e-13  # relative: half the sum of squares is itself rounded to so much
-_STOPPED = "The search was stopped after {}: half the sum of squares may fall by {:.2g}."
+_STOPPED = (
+    "The search was stopped after {}: half the sum of squares may fall by {:.2g}. Continue from there, with fit.params "
+    "in place of params0."
+)
 _KINK = (
     "The search stopped at a kink of the sum of squares after {}: derivatives promise to lower half of it by "
     "{:.2g}, the last {} trials lowered it by {:.2g}. Motion that sticks, or strikes, has such kinks; friction that "
