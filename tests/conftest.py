@@ -65,7 +65,7 @@ if version("jax").startswith("0.10."):
 
     def _context_of_thread():
         try:
-            ir.Context.current
+            _ = ir.Context.current
         except ValueError:  # no program is being lowered
             if not hasattr(_kept, "context"):
                 _kept.context = _make_context()

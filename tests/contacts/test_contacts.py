@@ -405,11 +405,13 @@ def test_contacts_in_a_text_about_the_system():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("draws", [False, True], ids=["the same tosses", "random ones"])
-def test_intervals_of_restitution_and_friction_hold_them_as_often_as_they_say(draws):
-    """Four noisy tosses along a rough floor, 50 times: within three standard errors, of 3.1 %, of 95 %."""
-    found = fit_tosses(50, draws)
-    assert found["not ok"] <= 3 * draws  # tosses that stop at once, and two that end at a kink
+def test_intervals_of_restitution_and_friction_hold_them_as_often_as_they_say():
+    """Four noisy tosses along a rough floor, 50 times: within three standard errors, of 3.1 %, of 95 %.
+
+    The tosses, e and μ are drawn at random; the benchmark repeats one toss, too.
+    """
+    found = fit_tosses(50, True)
+    assert found["not ok"] <= 3  # tosses that stop at once, and two that end at a kink
     for name in ("e", "mu"):
         assert abs(found[f"held {name}"] - 0.95) < 0.093 and abs(found[f"bias {name}"]) < 3
 
