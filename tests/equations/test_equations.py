@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from lagrangians import free_particle
-from scenes import FREE_POINTS
+from scenes import FREE_POINTS, particle
 from sweeps import KINDS, sweep
 
 import lagjax
@@ -179,7 +179,7 @@ def test_explain_names_borders_and_says_whether_they_are_located():
     assert "borders" not in str(smooth)
     single = BORDERED.explain(np.float32(0.0), np.float32(1.0))
     assert single.borders == facts.borders and single.borders_located
-    arrays = lagjax.System(free_particle, forces=forces_with_borders, path="array").explain(0.0, 1.0)
+    arrays = particle(forces_with_borders, path="array").explain(0.0, 1.0)
     assert not arrays.borders_located
 
 

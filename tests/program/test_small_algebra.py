@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from jax import lax
+from scenes import in_potential
 from sweeps import sweep
 
 import lagjax
@@ -281,7 +282,7 @@ def test_functions_that_xla_has_are_not_lowered(name):
 @pytest.mark.parametrize("name", sweep(LEFT_TO_XLA, kept=("eigenvalues",)))
 def test_functions_that_xla_has_run_on_arrays(name):
     potential, slope, reason = LEFT_TO_XLA[name]
-    system = lagjax.System(lambda q, v: 0.5 * v**2 - potential(q))
+    system = in_potential(potential)
     facts = system.explain(1.5, -0.5)
     assert "diffrax" in facts.solver and reason in facts.solver
     assert float(system.acceleration(1.5, 0.0)) == pytest.approx(-slope(1.5), rel=1e-13)
