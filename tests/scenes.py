@@ -36,3 +36,26 @@ EDGE = System(lambda q, qdot: 0.5 * qdot**2 - jnp.sqrt(q))  # ends at 0
 CLIFF = System(lambda q, qdot, params: 0.5 * qdot**2 - params * q - jnp.where(q < -1.0, jnp.log(q + 1.0), 0.0))
 RELAY = System(of.free_particle, forces=lambda q, qdot: -jnp.sign(q + qdot))  # slides along q + q̇ = 0
 SADDLE = System(lambda q, qdot: qdot[0] * qdot[1] - q[0] * q[1])  # a mass of both signs
+
+
+# Where a test is about a force, a potential or what holds a body, those alone are its own.
+
+
+def particle(forces, **more):
+    """A free particle under a force."""
+    return System(of.free_particle, forces=forces, **more)
+
+
+def particles(forces=None, **more):
+    """Free particles under forces, between walls, or held."""
+    return System(of.free_particles, forces=forces, **more)
+
+
+def in_potential(potential, **more):
+    """Particles of unit mass in V(q), or one."""
+    return System(lambda q, qdot: 0.5 * jnp.sum(qdot**2) - potential(q), **more)
+
+
+def weight_on(**held):
+    """A weight in the plane, and what holds it."""
+    return System(of.weight, **held)

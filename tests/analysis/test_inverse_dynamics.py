@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import sympy
+from scenes import weight_on
 
 import lagjax
 from lagjax import System
@@ -163,10 +164,10 @@ def test_friction_that_reads_the_multiplier_is_counted():
         along = jnp.stack([-q[1], q[0]])
         return -0.2 * jnp.abs(2 * multipliers["wire"]) * jnp.sign(v @ along) * along
 
-    bead = lambda more: System(
-        lambda q, v: 0.5 * v @ v - G * q[1], constraints=lambda q: {"wire": q @ q - 1.0},
+    bead = lambda more: weight_on(
+        constraints=lambda q: {"wire": q @ q - 1.0},
         forces=lambda q, v, multipliers: friction(q, v, multipliers) + more,
-    )  # fmt: skip
+    )
     a = np.asarray(bead(np.zeros(2)).acceleration(Q, V)) + 1.5 * ALONG
     tau = lagjax.inverse_dynamics(bead(np.zeros(2)), Q, V, a)
     np.testing.assert_allclose(bead(tau).acceleration(Q, V), a, rtol=1e-12)

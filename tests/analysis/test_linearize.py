@@ -144,7 +144,6 @@ def test_transformations():
     h = 1e-4
     by_m = (sample(2.0 + h) - sample(2.0 - h)) / (2 * h)
     np.testing.assert_allclose(jax.jacfwd(sample)(2.0), by_m, atol=1e-7)
-    np.testing.assert_allclose(jax.jacrev(sample)(2.0), by_m, atol=1e-7)
     np.testing.assert_allclose(jax.jit(jax.vmap(jax.jacrev(sample)))(jnp.array([1.0, 2.0]))[1], by_m, atol=1e-7)
     twice = (sample(2.0 + h) - 2 * sample(2.0) + sample(2.0 - h)) / h**2
     np.testing.assert_allclose(jax.jacfwd(jax.jacrev(sample))(2.0), twice, atol=1e-5)

@@ -310,8 +310,8 @@ def test_sympy_agrees():
 @pytest.mark.slow
 def test_more_coordinates_in_one_array_than_are_unfolded():
     """Scenes of more than 256 coordinates in one array had no equations: an IndexError."""
-    derivation = derivation_of(CHAIN, Layout.from_state(np.zeros(300), np.zeros(300)), np.ones(()))
-    assert derivation.shape("mass_matrix") == (300, 300)
+    derivation = derivation_of(CHAIN, Layout.from_state(np.zeros(257), np.zeros(257)), np.ones(()))
+    assert derivation.shape("mass_matrix") == (257, 257)
 
 
 def test_a_structure_that_the_lagrangian_does_not_read():

@@ -99,9 +99,9 @@ def test_bodies_have_ten_galilean_charges():
 
 
 @pytest.mark.slow
-def test_ten_times_as_many_bodies():
-    q, v = (jax.random.normal(jax.random.key(k), (30, 3)) for k in range(2))
-    assert names(BODIES, q, v, np.linspace(1.0, 2.0, 30)) == GALILEAN
+def test_twenty_bodies():
+    q, v = np.random.default_rng(0).normal(size=(2, 20, 3))
+    assert names(BODIES, q, v, np.linspace(1.0, 2.0, 20)) == GALILEAN
 
 
 @pytest.mark.slow
@@ -138,8 +138,8 @@ RANDOM = lagjax.System(general)
 
 
 @pytest.mark.slow
-def test_no_false_report_on_100_random_systems():
-    for seed in range(100):
+def test_no_false_report_on_random_systems():
+    for seed in range(25):
         draw = np.random.default_rng(seed).normal
         shapes = {"m": (3, 3), "a": (4,), "k": (4, 3), "f": (4,), "c": (4,), "b": (3,)}
         params = {name: draw(size=shape) for name, shape in shapes.items()}
@@ -174,10 +174,10 @@ def test_forces_with_a_potential_conserve_what_l_would():
     found = {c.name: c for c in lagjax.conserved_quantities(KEPLER_BY_FORCE, *state, 1.3)}
     assert list(found) == ["energy", "angular momentum in the plane 01"]
     run = lagjax.simulate(KEPLER_BY_FORCE, *state, np.linspace(0.0, 20.0, 50), 1.3)
-    energy = jax.vmap(lambda q, v: found["energy"].charge(q, v, params=1.3))(run.q, run.qdot)
+    energy = jax.jit(jax.vmap(lambda q, v: found["energy"].charge(q, v, params=1.3)))(run.q, run.qdot)
     exact = 0.5 * np.sum(run.qdot**2, axis=1) - 1.3 / np.linalg.norm(run.q, axis=1)
     np.testing.assert_allclose(energy - energy[0], exact - exact[0], atol=1e-9)
-    by_params = jax.grad(lambda k: found["energy"].charge(run.q[7], run.qdot[7], params=k))(1.3)
+    by_params = jax.jit(jax.grad(lambda k: found["energy"].charge(run.q[7], run.qdot[7], params=k)))(1.3)
     np.testing.assert_allclose(by_params, 1.0 - 1 / np.linalg.norm(run.q[7]), rtol=1e-9)
     assert "energy" not in names(CURL, *state)
 

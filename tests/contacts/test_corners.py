@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import particles
 
 import lagjax
 
@@ -113,10 +114,8 @@ def test_a_corner_that_is_missed_by_a_hair_unfolds(n, aside):
 def test_a_particle_goes_from_corner_to_corner_of_a_square(impacts, turn):
     """A hundred corners, along one diagonal; its walls may be turned against the coordinates."""
     way = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])  # into the square's coordinates
-    square = lagjax.System(
-        lambda q, v: 0.5 * v @ v, contacts=lambda q: jnp.concatenate([1 + way @ q, 1 - way @ q]), restitution=1.0,
-        impacts=impacts,
-    )  # fmt: skip
+    walls = lambda q: jnp.concatenate([1 + way @ q, 1 - way @ q])
+    square = particles(contacts=walls, restitution=1.0, impacts=impacts)
     duration = 200.3
 
     def end(x):

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import weight_on
 
 import lagjax
 
@@ -234,8 +235,7 @@ def test_a_block_that_friction_barely_holds_rocks_to_rest():
 def test_a_particle_slides_up_a_drum_while_another_coordinate_stops():
     """With u = θ̇² on a circle of radius 1 u′ = −2g sin θ − 2μ (g cos θ + u); the third coordinate stops by itself."""
     mu, speed = 0.3, 3.0
-    drum = lagjax.System(
-        lambda q, v: 0.5 * v @ v - G * q[1],
+    drum = weight_on(
         forces=lambda q, v: jnp.array([0.0, 0.0, -jnp.sign(v[2])]),
         contacts=lambda q: 1.0 - jnp.hypot(q[0], q[1]),
         friction=mu,

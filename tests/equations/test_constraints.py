@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 from lagrangians import free_particles, weight
-from scenes import WEIGHT, WEIGHT_ON_A_SLIDE
+from scenes import WEIGHT, WEIGHT_ON_A_SLIDE, particles, weight_on
 from sweeps import sweep
 
 import lagjax
@@ -211,7 +211,7 @@ def test_doubled_and_scaled_constraints_change_no_motion():
     q0, qdot0 = hung(1.2, 0.5)
     ts = np.linspace(0, 2, 3)
     systems = [WEIGHT_ON_A_ROD, STIFF_ROD]
-    systems += [lagjax.System(weight, constraints=many, path=path) for path in ("auto", "array")]
+    systems += [weight_on(constraints=many, path=path) for path in ("auto", "array")]
     once, scaled, *twice = (lagjax.simulate(system, q0, qdot0, ts, rtol=1e-11) for system in systems)
     for other in (scaled, *twice):
         assert np.max(np.abs(other.q - once.q)) < 1e-10 and np.max(np.abs(other.qdot - once.qdot)) < 1e-10
@@ -230,7 +230,7 @@ def test_doubled_and_scaled_constraints_change_no_motion():
 def test_explain_says_what_constraints_cost_and_which_depend():
     q, v = jnp.array([0.6, -0.8, 0.0]), jnp.zeros(3)
     mixed = lambda q: {"a rod": rod(q)["rod"], "floor": q[2], "mix": rod(q)["rod"] + 3 * q[2]}
-    facts = lagjax.System(weight, constraints=mixed).explain(q, v)
+    facts = weight_on(constraints=mixed).explain(q, v)
     assert facts.dependent_constraints == {"constraints['mix']": ("constraints['a rod']", "constraints['floor']")}
     assert facts.projection_operations > 0 and facts.energy_conserved
     assert "dependent         constraints['mix'] on constraints['a rod'], constraints['floor']" in str(facts)
@@ -263,7 +263,7 @@ def test_a_pendulum_on_a_shaken_support(path):
         height = q[1] - params["a"] * jnp.cos(params["Omega"] * t)
         return {"rod": 0.5 * (1 - q[0] ** 2 - height**2)}
 
-    system = lagjax.System(weight, constraints=held, path=path)
+    system = weight_on(constraints=held, path=path)
     angle, ts = 1.0, np.linspace(0, 2, 3)
     free = lagjax.simulate(minimal.system, angle, 0.0, ts, params, rtol=1e-12)
     q0 = np.array([np.sin(angle), 0.3 - np.cos(angle)])
@@ -828,7 +828,7 @@ def test_velocities_that_cannot_be_met_have_nan_for_derivatives():
 def test_a_state_without_a_nearest_one_has_nan_for_derivatives_and_leaves_its_neighbours_alone():
     root = lambda q: jnp.sqrt(q[0] - 1.0) + q[1]
     states = np.array([[1.3, -0.4, 0.2, -0.4], [0.5, 0.2, 0.2, -0.4]])
-    system = lagjax.System(free_particles, constraints=root)
+    system = particles(constraints=root)
     slopes = jax.jit(jax.vmap(jax.jacfwd(lambda x: jnp.concatenate(system.project(x[:2], x[2:])))))(states)
     assert np.isfinite(slopes[0]).all() and np.isnan(slopes[1]).all()
 
@@ -875,7 +875,7 @@ KEPT = ("project", "qdot0 does not", "not finite", "zero gradient", "value of qd
     sweep(STARTS, kept=lambda start: any(words in start[-1] for words in KEPT)),
 )
 def test_starts_that_cannot_be(constraints, q0, qdot0, sentence):
-    system = lagjax.System(weight, constraints=constraints)
+    system = weight_on(constraints=constraints)
     with pytest.raises(ValueError, match=sentence):
         lagjax.simulate(system, np.array(q0), np.array(qdot0), np.array([0.0, 1.0]))
 
@@ -926,18 +926,18 @@ NAMED_TWICE = lagjax.System(weight, constraints=lambda q: {"x": q[0]}, velocity_
 
 def test_signatures_and_names_that_are_refused():
     with pytest.raises(TypeError, match=r"constraints must have the form constraints\(q\)"):
-        lagjax.System(weight, constraints=lambda: 0.0)
+        weight_on(constraints=lambda: 0.0)
     with pytest.raises(TypeError, match="asks for `qdot`"):
-        lagjax.System(weight, constraints=lambda q, qdot: q[0])
+        weight_on(constraints=lambda q, qdot: q[0])
     with pytest.raises(TypeError, match=r"velocity_constraints must have the form"):
-        lagjax.System(weight, velocity_constraints=lambda q: q[0])
+        weight_on(velocity_constraints=lambda q: q[0])
     with pytest.raises(ValueError, match="have the same name: x"):
         NAMED_TWICE.acceleration(ORIGIN, REST)
     for nothing in (lambda q: {}, lambda q: jnp.zeros(0)):
         with pytest.raises(TypeError, match="at least one number"):
-            lagjax.System(weight, constraints=nothing).acceleration(ORIGIN, REST)
+            weight_on(constraints=nothing).acceleration(ORIGIN, REST)
     with pytest.raises(TypeError, match="real floating-point"):
-        lagjax.System(weight, constraints=lambda q: q[0] > 0).acceleration(ORIGIN, REST)
+        weight_on(constraints=lambda q: q[0] > 0).acceleration(ORIGIN, REST)
     for question in ("multipliers", "constraint_force", "constraint_residual", "project"):
         with pytest.raises(ValueError, match="no constraints"):
             getattr(WEIGHT, question)(ORIGIN, REST)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import weight_on
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from sweeps import sweep
@@ -471,7 +472,7 @@ def test_a_law_whose_piece_ends_beyond_zero(share):
     def forces(q, v, multipliers):
         return jnp.array([multipliers, share * jnp.minimum(multipliers, 5.0)])
 
-    pressed = lagjax.System(lambda q, v: 0.5 * v @ v - G * q[1], forces=forces, constraints=lambda q: q[1])
+    pressed = weight_on(forces=forces, constraints=lambda q: q[1])
     exact = G / (1 + share) if G / (1 + share) < 5 else G - 5 * share
     assert float(pressed.acceleration(jnp.zeros(2), jnp.zeros(2))[0]) == pytest.approx(exact, rel=1e-12)
 

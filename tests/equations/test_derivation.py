@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from scenes import SADDLE
+from scenes import SADDLE, in_potential, weight_on
 
 import lagjax
 from lagjax import scenes
@@ -111,11 +111,9 @@ _cubic.defjvp(lambda x, dx: (_cubic(*x), 7.0 * x[0] * dx[0]))  # not its derivat
 
 
 def test_derivatives_that_a_lagrangian_defines_itself():
-    def lagrangian(q, v):
-        return 0.5 * v @ v - jnp.sum(jax.vmap(_cubic)(q)) - q[0] * jax.lax.stop_gradient(q[1])
-
+    scene = in_potential(lambda q: jnp.sum(jax.vmap(_cubic)(q)) + q[0] * jax.lax.stop_gradient(q[1]))
     q, v = np.array([[0.3, 0.7]]), np.zeros((1, 2))
-    derivation = of(lagjax.System(lagrangian), q[0], v[0])
+    derivation = of(scene, q[0], v[0])
     force = derivation.evaluate(["force"], columns_of(q, v, 0.0, []))["force"][0]
     np.testing.assert_allclose(force, [-7 * 0.3 - 0.7, -7 * 0.7], rtol=1e-15)
     assert derivation.form_in_xla.kind == "arrays"  # a program keeps the rules of two derivatives alone
@@ -123,11 +121,12 @@ def test_derivatives_that_a_lagrangian_defines_itself():
 
 def test_powers_have_derivatives_where_their_products_and_roots_have_none():
     # x¹·⁵ is x √x, whose factors have no derivative at zero.
-    def lagrangian(q, v):
-        return 0.5 * v @ v - jnp.sum(jnp.maximum(q, 0.0) ** 2.5) - jnp.sum(jnp.abs(q) ** 1.5) - jnp.sum(q**20)
-
+    scene = in_potential(
+        lambda q: jnp.sum(jnp.maximum(q, 0.0) ** 2.5 + jnp.abs(q) ** 1.5 + q**20),
+        constraints=lambda q: q[0] ** 2 + q[1] ** 1.5 - 0.125,
+    )
     q, v = np.array([[0.0, 0.25]]), np.array([[0.3, 0.4]])
-    derivation = of(lagjax.System(lagrangian, constraints=lambda q: q[0] ** 2 + q[1] ** 1.5 - 0.125), q[0], v[0])
+    derivation = of(scene, q[0], v[0])
     values = derivation.evaluate(["force", "jacobian", "gamma"], columns_of(q, v, 0.0, []))
     np.testing.assert_allclose(values["force"], [[0.0, -2.5 * 0.125 - 0.75 - 20 * 0.25**19]], rtol=1e-14)
     np.testing.assert_allclose(values["jacobian"], [[[0.0, 0.75]]], rtol=1e-14)
@@ -214,7 +213,7 @@ def test_a_state_without_a_compiler_is_the_compiled_one():
             np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11)
     # Redundant constraints: the shortest multipliers in both.
     rod = lambda q: jnp.array([q @ q - 1.0, 3 * (q @ q) - 3.0])
-    twice = lagjax.System(lambda q, v: 0.5 * v @ v - 9.81 * q[1], constraints=rod)
+    twice = weight_on(constraints=rod)
     q, v = jnp.array([0.6, -0.8]), jnp.array([0.4, 0.3])
     np.testing.assert_allclose(twice.multipliers(q, v), jax.jit(twice.multipliers)(q, v), rtol=1e-9)
 

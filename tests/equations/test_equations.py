@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from lagrangians import free_particle
-from scenes import FREE_POINTS
+from scenes import FREE_POINTS, particle
 from sweeps import KINDS, sweep
 
 import lagjax
@@ -32,9 +32,9 @@ INDEFINITE = lagjax.System(lambda q, v: v[0] * v[1] + v[2] * v[0] + 0.5 * v[2] *
 COMPLEX_STIFFNESS = lagjax.System(lambda q, v, params: 0.5 * v @ v - 0.5 * jnp.abs(params["z"]) ** 2 * q @ q)
 
 
-# Beside these every third scene: the motions of all, by the scalar form, are held to their laws in tests/scenes.
+# Beside these every sixth scene: the motions of all, by the scalar form, are held to their laws in tests/scenes.
 @pytest.mark.parametrize(
-    "make", sweep([make for k, make in enumerate(scenes.ALL) if make in KINDS or k % 3 == 0], kept=FAST),
+    "make", sweep([make for k, make in enumerate(scenes.ALL) if make in KINDS or k % 6 == 0], kept=FAST),
     ids=lambda make: make.__name__,
 )  # fmt: skip
 def test_both_forms_of_scenes_agree(make):
@@ -179,7 +179,7 @@ def test_explain_names_borders_and_says_whether_they_are_located():
     assert "borders" not in str(smooth)
     single = BORDERED.explain(np.float32(0.0), np.float32(1.0))
     assert single.borders == facts.borders and single.borders_located
-    arrays = lagjax.System(free_particle, forces=forces_with_borders, path="array").explain(0.0, 1.0)
+    arrays = particle(forces_with_borders, path="array").explain(0.0, 1.0)
     assert not arrays.borders_located
 
 

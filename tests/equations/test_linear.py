@@ -41,12 +41,11 @@ def solved_or_singular(matrix, b):
     return factorization.solve(b), factorization.singular
 
 
-OTHERS = [pytest.param(n, marks=pytest.mark.slow) for n in (2, 7, 16, 17, 200)]
+SIZES = [(n, np.float64) for n in (1, 40, 2, 7, 16, 17, 200)] + [(n, np.float32) for n in (1, 17, 200)]
 
 
-@pytest.mark.parametrize("dtype", sweep([np.float64, np.float32], kept=[np.float64]))
 @pytest.mark.parametrize("kind", [definite, indefinite])
-@pytest.mark.parametrize("n", [1, 40, *OTHERS])  # one panel and no other; some and a part of one
+@pytest.mark.parametrize(("n", "dtype"), sweep(SIZES, kept=SIZES[:2]))  # one panel and no other; some and a part of one
 def test_the_solution_is_that_of_lapack(n, kind, dtype):
     matrix, b = kind(n), np.random.default_rng(n).normal(size=n)
     x = solved(jnp.asarray(matrix, dtype), jnp.asarray(b, dtype))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from lagrangians import free_particle, free_particles
-from scenes import SADDLE
+from scenes import SADDLE, particle
 from sweeps import sweep
 
 import lagjax
@@ -187,10 +187,10 @@ def test_rules_and_tables_of_the_user_are_followed_in_derivatives():
         return x**2
 
     square.defjvp(lambda x, dx: (square(*x), 7.0 * dx[0]))
-    ruled = lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v: square(q))
+    ruled = particle(lambda q, v: square(q))
     assert jax.jacfwd(ruled.acceleration)(0.5, 0.0) == 7.0
     table = lagjax.samples(np.linspace(0.0, 1.0, 3), np.array([0.0, 1.0, 0.0]), hold="linear")
-    pushed = lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v, t: table(t) * q)
+    pushed = particle(lambda q, v, t: table(t) * q)
     slopes = jax.jacfwd(pushed.acceleration, (0, 2))(0.5, 0.0, 0.3)
     np.testing.assert_allclose(slopes, [0.6, 1.0], rtol=1e-14)
 

@@ -231,7 +231,7 @@ def test_a_puck_between_walls_is_found_from_far_or_said_not_to_be():
         maps = {"mu": lagjax.positive, "e": lagjax.between(0.0, 1.0)}
         return lagjax.fit(PUCK, record, {"mu": mu, "e": e}, transforms=maps, **options)
 
-    for first in ((0.05, 0.8, 2.0), (0.1, 0.9, 1.5), (0.2, 0.6, 2.5)):
+    for first in ((0.1, 0.9, 1.5), (0.2, 0.6, 2.5)):
         found = fit(exact + noise, *first)
         low, high = found.intervals(0.999)
         assert found.ok and found.rms["q"] < 2.2e-3 and all(low[k] <= x <= high[k] for k, x in truth.items())

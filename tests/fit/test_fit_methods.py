@@ -247,14 +247,9 @@ def test_many_starts_find_a_frequency_that_one_does_not(capfd):
     assert len(falls) == 64 and (np.diff(falls) >= 0).all() and falls[-1] > 10 * falls[0]
     assert "starts      64, of which" in str(fit)
     assert "motions, residuals" in capfd.readouterr().err
-
-
-@pytest.mark.slow
-def test_256_starts_come_to_the_same_again():
-    first, again = many(starts=256), many(starts=256)
-    np.testing.assert_array_equal(again.u, first.u)
-    np.testing.assert_array_equal(again.waterfall.misfits, first.waterfall.misfits)
-    assert len(again.waterfall.misfits) == 256 and abs(first.params["k"] - 36.0) < 0.05
+    again = many(starts=64)
+    np.testing.assert_array_equal(again.u, fit.u)
+    np.testing.assert_array_equal(again.waterfall.misfits, falls)
 
 
 def test_many_starts_find_the_deeper_of_two_minima():

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import lagrangians
 import numpy as np
 import pytest
-from scenes import OSCILLATOR
+from scenes import OSCILLATOR, particle
 
 import lagjax
 
@@ -107,7 +107,7 @@ def test_only_what_decides_is_searched_for_jumps():
     """A bracket about a jump is halved thirty times; an elimination, which compares pivots, does not jump."""
 
     def searches(force):
-        system = lagjax.System(lagrangians.free_particle, forces=lambda q, qdot: force(q) - q, path="array")
+        system = particle(lambda q, qdot: force(q) - q, path="array")
         run = lambda v: lagjax.simulate(system, 0.3, v, TS, **HEUN).q[-1]
         return "length=30" in str(jax.make_jaxpr(lambda v: jax.vjp(run, v)[0])(1.0))
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import OSCILLATOR, OSCILLATORS, RAMP
+from scenes import OSCILLATOR, OSCILLATORS, RAMP, in_potential, particle
 
 import lagjax
 
@@ -57,7 +57,7 @@ def test_a_sweep_over_a_parameter_without_its_batch_axis_is_told_of_batch_axes()
 @pytest.mark.parametrize("height", [lambda q: math.cos(q), lambda q: np.cos(q), lambda q: q if q > 0 else 0.0])
 def test_functions_that_ask_for_values_are_told_what_to_write(height):
     with pytest.raises(TypeError) as error:
-        lagjax.simulate(lagjax.System(lambda q, v: 0.5 * v**2 - height(q)), 1.0, 0.0, np.arange(3.0))
+        lagjax.simulate(in_potential(height), 1.0, 0.0, np.arange(3.0))
     text, line = str(error.value), height.__code__.co_firstlineno
     assert f"<lambda>, line {line} of test_mistakes.py, `" in text and "traced array" not in text
     assert "Write jnp.cos(q) for math.cos(q)" in text and "jnp.where(q > 0, a, b) for `if q > 0`" in text
@@ -149,7 +149,7 @@ def _follow_pulses(rate):
 
 @pytest.mark.parametrize("force", [lambda q, v: 1 - 3 * (v > 0.1), lambda q, v: v < 0.1])
 def test_whole_numbers_and_comparisons_are_forces(force):
-    system = lagjax.System(lambda q, v: 0.5 * v**2, forces=force)
+    system = particle(force)
     np.testing.assert_allclose(lagjax.simulate(system, 1.0, 0.0, np.array([0.0, 5.0])).q[-1], 1.495, rtol=1e-12)
 
 

@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from lagrangians import free_particle
-from scenes import BALL_IN_GRAVITY, BALL_ON_THE_FLOOR, FREE, RELAY
+from scenes import BALL_IN_GRAVITY, BALL_ON_THE_FLOOR, FREE, RELAY, particle
 from scipy.integrate import solve_ivp
 
 import lagjax
@@ -97,8 +96,8 @@ def test_a_block_that_stops_where_its_load_is_beyond_the_static_limit_goes_on():
     load = lambda t, xp=jnp: 12 * xp.sin(6 * t) * t / (1 + t) - G * np.sin(0.1)
     static, kinetic = 0.6 * G * np.cos(0.1), 0.3 * G * np.cos(0.1)
     stop = lambda q, v: (q, 0 * v)
-    slip = lambda s: lagjax.System(free_particle, forces=lambda q, v, t: load(t) - s * kinetic)
-    stick = lagjax.System(free_particle, forces=lambda q, v, t: load(t), velocity_constraints=lambda q, v: v)
+    slip = lambda s: particle(lambda q, v, t: load(t) - s * kinetic)
+    stick = particle(lambda q, v, t: load(t), velocity_constraints=lambda q, v: v)
     law = [
         T("stick", "up", lambda q, v, t: load(t) - static, 1),
         T("stick", "down", lambda q, v, t: load(t) + static, -1),
@@ -131,7 +130,7 @@ def test_a_block_that_stops_where_its_load_is_beyond_the_static_limit_goes_on():
 
 
 def test_transitions_that_go_back_and_forth_are_both_named():
-    push = lambda s: lagjax.System(free_particle, forces=lambda q, v: s + 0.0 * q)
+    push = lambda s: particle(lambda q, v: s + 0.0 * q)
     law = [T("left", "right", lambda q, v: q + v, -1), T("right", "left", lambda q, v: q + v, 1)]
     with pytest.raises(lagjax.SimulationError, match=r"(?s)one instant.*sign or where.*'left' → 'right'") as caught:
         lagjax.simulate(
@@ -213,9 +212,9 @@ def test_a_freewheel_and_a_block_let_go_where_nothing_moves_yet():
     np.testing.assert_allclose(runs.end.qdot, np.stack([a / w / 3 - a / w, a / w / 3], 1), rtol=1e-10, atol=1e-12)
 
     stop, load = lambda q, v: (q, 0 * v), lambda t, p: p[0] * jnp.sin(p[1] * t)
-    slip = lambda s: lagjax.System(free_particle, forces=lambda q, v, t, params: load(t, params) - s * params[2])
+    slip = lambda s: particle(lambda q, v, t, params: load(t, params) - s * params[2])
     stick = lambda q, v, t, params: load(t, params)
-    modes = {"stick": lagjax.System(free_particle, forces=stick, velocity_constraints=lambda q, v: v)}
+    modes = {"stick": particle(stick, velocity_constraints=lambda q, v: v)}
     modes |= {"up": slip(1), "down": slip(-1)}
     law = [
         T("stick", "up", lambda q, v, multipliers, params: -multipliers - params[2], 1),
@@ -223,7 +222,7 @@ def test_a_freewheel_and_a_block_let_go_where_nothing_moves_yet():
         T("up", "stick", lambda q, v: v, -1, stop), T("down", "stick", lambda q, v: v, 1, stop),
     ]  # fmt: skip
     friction = lambda q, v, t, params: load(t, params) - params[2] * jnp.sign(v)
-    one, ts = lagjax.System(free_particle, forces=friction), np.linspace(0.0, 6.0, 4)
+    one, ts = particle(friction), np.linspace(0.0, 6.0, 4)
     params = np.stack([rng.uniform(1, 3, 20), rng.uniform(0.5, 3, 20), rng.uniform(0.2, 0.9, 20)], 1)
     run = lambda p: lagjax.simulate(lagjax.Hybrid(modes, law, "stick"), 0.0, 0.0, ts, p, throw=False)
     runs = jax.jit(jax.vmap(run))(params)

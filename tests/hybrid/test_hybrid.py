@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from lagrangians import free_particle
-from scenes import BALL_IN_GRAVITY, BALL_ON_THE_FLOOR, EDGE, FREE, FREE_POINTS, HENON_HEILES, OSCILLATOR
+from scenes import BALL_IN_GRAVITY, BALL_ON_THE_FLOOR, EDGE, FREE, FREE_POINTS, HENON_HEILES, OSCILLATOR, particle
 from sweeps import sweep
 
 import lagjax
@@ -156,7 +156,7 @@ def test_a_force_read_off_samples_of_parameters_in_a_mode():
         return lagjax.samples(knots, params["u"], "linear")(t)
 
     wall = lagjax.Transition("free", "free", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -v))
-    modes = {"free": lagjax.System(free_particle, forces=force)}
+    modes = {"free": particle(force)}
     run = lagjax.simulate(lagjax.Hybrid(modes, [wall], "free"), 1.0, -1.0, np.array([0.0, 3.0]), {"u": a * knots})
     met = min(root.real for root in np.roots([a / 6, 0.0, -1.0, 1.0]) if abs(root.imag) < 1e-12 and root.real > 0)
     back, left = 1.0 - 0.5 * a * met**2, 3.0 - met

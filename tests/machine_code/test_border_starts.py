@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import in_potential
 
 import lagjax
 
@@ -245,9 +246,7 @@ TIES = {
 def test_a_tie_that_a_motion_leaves_does_not_hold_it(potential, way):
     """Compiles one motion, forwards and back: one border reads what is decided at another one, all at q = 0."""
     V, speeds, ends = TIES[potential]
-    run = lagjax.simulate(
-        lagjax.System(lambda q, v: 0.5 * v @ v - V(q)), np.zeros(3), way * np.array(speeds), way * np.array([0.0, 1.0])
-    )
+    run = lagjax.simulate(in_potential(V), np.zeros(3), way * np.array(speeds), way * np.array([0.0, 1.0]))
     np.testing.assert_allclose(run.q[-1], ends, atol=1e-12)
 
 

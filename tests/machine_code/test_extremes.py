@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import particle, particles
 
 import lagjax
 
@@ -79,7 +80,7 @@ def test_narrow_pulses_are_met_from_where_cosh_is_infinite(width):
     def end(params):
         return lagjax.simulate(system, np.full(3, -1.0), np.ones(3), np.array([0.0, 2.5]), params)
 
-    system, strength = lagjax.System(lambda q, v: 0.5 * v @ v, forces=pulses), 1.0
+    system, strength = particles(pulses), 1.0
     found = end(strength)
     assert found.stats["num_steps"] < 1000
     # The energies that these forces give: 2 a width, a and a width.
@@ -114,7 +115,7 @@ def test_rates_whose_powers_overflow_on_the_way():
 
     def end(length, time):
         pulse = lambda q, v: -0.3 * length / time**2 * 1e3 / jnp.cosh((q / length - 0.2) * 1e5) ** 2
-        system = lagjax.System(lambda q, v: 0.5 * v**2, forces=pulse)
+        system = particle(pulse)
         return lagjax.simulate(system, 0.0, 1.5 * length / time, jnp.array([0.0, 10 * time])).q[-1] / length
 
     np.testing.assert_allclose(end(1e-10, 1e-13), end(1.0, 1.0), rtol=1e-8)

@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from lagrangians import free_particle, free_particles
+from lagrangians import free_particles
+from scenes import particle, particles
 
 import lagjax
 
@@ -106,7 +107,7 @@ def test_knots_that_do_not_increase_are_said():
 def test_second_derivatives_by_knots_of_a_force():
     """The force is continuous at its knots: second derivatives exist, and are those of differences."""
     force = lambda q, qdot, params: -2 * q - jnp.interp(q, params["x"], params["u"])
-    scene, params = lagjax.System(free_particle, forces=force), table(8)
+    scene, params = particle(force), table(8)
     slope = jax.grad(lambda p: end_of(scene, p, solver=MACHINE))
     along = {"x": jnp.cos(jnp.arange(8.0)), "u": jnp.sin(jnp.arange(8.0))}
     curved = jax.jvp(slope, (params,), (along,))[1]
@@ -135,7 +136,7 @@ def test_second_and_third_derivatives_by_knots_of_a_potential():
         lambda f: jax.grad(lambda p: sum(jnp.vdot(along[name], jax.grad(f)(p)[name]) for name in "xu")),
         lambda f: lambda p: jax.jit(jax.vmap(moved(jax.grad(f))))(jax.tree.map(lambda x: jnp.stack([x, 1.01 * x]), p)),
     ):  # fmt: skip
-        found, closed = transform(end)(params), transform(exact_end)(params)
+        found, closed = transform(end)(params), jax.jit(transform(exact_end))(params)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-9), found, closed)
 
 
@@ -143,7 +144,7 @@ def test_second_and_third_derivatives_by_knots_of_a_potential():
 def test_where_a_knot_is_grazed_there_are_no_derivatives():
     """A motion that turns where its force changes: whether it comes there, a change within the tolerance decides."""
     force = lambda q, qdot, params: jnp.where(jnp.searchsorted(params["x"], q, side="right") > 1, -2.0, -1.0)
-    scene, ts = lagjax.System(free_particle, forces=force), np.array([0.0, 3.0])
+    scene, ts = particle(force), np.array([0.0, 3.0])
     end = lambda x: lagjax.simulate(scene, 0.0, 1.0, ts, {"x": x}, solver=MACHINE).q[-1]
     touched, passed = (np.array([-10.0, x, 10.0]) for x in (0.5 - 1e-12, 0.4))
     # It passes x after 1 − v with v = √(1 − 2x), comes back after v more, and has two seconds left.
@@ -191,7 +192,7 @@ def test_tables_that_are_computed(name):
 def test_a_step_by_digitize(right):
     """A force that is another one between any two edges, to the right; the closed form is that of the potential."""
     force = lambda q, qdot, params: -params["f"][jnp.digitize(q, params["x"], right=right) - 1]
-    scene, params = lagjax.System(free_particle, forces=force), table(8)
+    scene, params = particle(force), table(8)
     slopes = (params["u"][1:] - params["u"][:-1]) / (params["x"][1:] - params["x"][:-1])
 
     def closed(f, x):
@@ -246,7 +247,7 @@ def test_a_table_of_any_length_is_looked_up(where):
         force, params = lambda q, qdot, t, params: jnp.interp(t, params["t"], params["u"]), table
     else:
         force, params = lambda q, qdot, t: jnp.interp(t, table["t"], table["u"]), None
-    scene = lagjax.System(free_particle, forces=force)
+    scene = particle(force)
     run = lagjax.simulate(scene, 0.0, 0.0, END, params, solver=MACHINE)
     np.testing.assert_allclose(run.q[-1], 1.2**3 / 6, rtol=1e-12)
 
@@ -313,7 +314,7 @@ def integer_entries(a, b, table, mask):
 def test_entries_of_integers_and_masks_are_computed_with_as_such(where):
     n, closed = 33, (jnp.asarray(INTEGERS), jnp.asarray(MASK))
     forces = lambda q, qdot, params: integer_entries(q[0], q[1], *(closed if where == "a closure" else params))
-    scene, instant = lagjax.System(free_particles, forces=forces), 1e-9
+    scene, instant = particles(forces), 1e-9
     for a, b in [(-0.9, 0.3), (0.3, -0.7), (1.2, 0.7)]:
         q = jnp.zeros(n).at[:2].set(jnp.array([a, b]))
         exact = jax.jit(integer_entries)(a, b, *closed)
@@ -336,7 +337,7 @@ def test_a_force_and_a_mass_by_integers_of_a_table(what):
         return q + v * left + (what == "force") * halves[2] * left**2 / 2
 
     half = lambda q: table[cell(q)] // 2
-    push = lagjax.System(free_particle, forces=lambda q, qdot: 1.0 * half(q))
+    push = particle(lambda q, qdot: 1.0 * half(q))
     heavy = lagjax.System(lambda q, qdot: 0.5 * (1 + half(q)) * qdot**2)
     scene = push if what == "force" else heavy
     end = lambda q: lagjax.simulate(scene, q, 1.0, jnp.array([0.0, 0.9]), solver=MACHINE).q[-1]

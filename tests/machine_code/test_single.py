@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import lagrangians
 import numpy as np
 import pytest
-from scenes import BALL_G, FREE_POINTS, KEPLER, OSCILLATOR, RAMP
+from scenes import BALL_G, FREE_POINTS, KEPLER, OSCILLATOR, RAMP, particle
 from sweeps import sweep
 
 import lagjax
@@ -340,7 +340,7 @@ def test_no_member_of_many_leaves_its_box(off):
 @pytest.mark.parametrize("place", [0.3, 0.7])
 def test_a_motion_that_starts_on_a_border_of_its_force(off, place):
     """−sign(q − place): from there with v = ½ it comes back after 1, and as far on the other side after 2."""
-    system = lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v: -jnp.sign(q - place))
+    system = particle(lambda q, v: -jnp.sign(q - place))
     for speed in (0.5, -0.5):
         run = lagjax.simulate(system, place, speed, np.float32([0.0, 0.5, 1.5, 3.5]))
         np.testing.assert_allclose(run.q - place, speed * np.array([0, 0.25, -0.25, -0.25]), atol=4 * EPS)

@@ -1,11 +1,12 @@
 """Gradients of scenes with many parts, against central differences.
 
-Every gradient is taken in a process of its own: the LLVM in llvmlite's wheels checks assertions, and one that fails
-ends the process instead of raising.
+Gradients are taken in another process, with the LLVM of users: that in llvmlite's wheels checks assertions, and one
+that fails ends the process instead of raising.
 """
 
 import concurrent.futures
 import multiprocessing
+from concurrent.futures.process import BrokenProcessPool
 
 import jax
 import jax.numpy as jnp
@@ -61,11 +62,23 @@ def slopes(name, count):
         return float(jax.jit(jax.grad(value))(q0) @ direction), float(differences)
 
 
-def in_a_process(function, *arguments):
-    """What a function returns in a new process. Raises `BrokenProcessPool` where the process ends without it."""
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as pool:
-        return pool.submit(function, *arguments).result()
+@pytest.fixture(scope="module")
+def in_a_process():
+    """What a function returns in another process, one for a file; where it ends without that, a test fails, no more."""
+    pools = []
+
+    def call(function, *arguments):
+        if not pools:
+            pools.append(concurrent.futures.ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")))
+        try:
+            return pools[0].submit(function, *arguments).result()
+        except BrokenProcessPool:
+            pools.clear()
+            raise
+
+    yield call
+    for pool in pools:
+        pool.shutdown()
 
 
 # Between the sizes of `test_derivative_sizes.py`, where five bodies are those that LLVM once did not survive.
@@ -74,7 +87,7 @@ LARGE = [("bodies in the plane", 7), ("chain", 10)]
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "count"), LARGE)
-def test_gradients_of_large_scenes(name, count):
+def test_gradients_of_large_scenes(in_a_process, name, count):
     found, expected = in_a_process(slopes, name, count)
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
+from scenes import in_potential, particle
 from sweeps import sweep
 
 import lagjax
@@ -107,7 +108,7 @@ BRANCHES = {
 def test_a_branch_that_is_not_taken_has_no_slope(name):
     """Of `cond` and `switch`, whatever the branch is there: NaN, or infinite at zero."""
     potential = BRANCHES[name]
-    scene = lagjax.System(lambda q, v: 0.5 * v @ v - potential(q))
+    scene = in_potential(potential)
     derivation = derivation_of(scene, Layout.from_state(np.zeros(2), np.zeros(2)), None)
     points = np.array([[-0.5, 0.3], [0.5, 0.3], [-0.5, -0.3], [0.3, -0.2], [0.0, 0.3], [0.0, 0.0]])
     columns = [*points.T, *np.zeros((3, len(points)))]
@@ -166,11 +167,11 @@ def test_powers_of_lengths_have_slopes_at_zero(name):
 @pytest.mark.parametrize("power", [1.0, 1.5, 2.5])
 def test_a_motion_begins_and_passes_where_a_length_is_zero(power):
     """Along a line through the centre of |z|ᵖ, and of Re zᵖ along its real axis, it is that of one coordinate."""
-    one = lagjax.System(lambda q, v: 0.5 * v**2 - abs(q) ** power)
+    one = in_potential(lambda q: abs(q) ** power)
     modulus = lambda q: jnp.abs(q[0] + 1j * q[1]) ** power
     cases = [(modulus, 0.0), (modulus, -0.05), (lambda q: jnp.real((q[0] + 1j * q[1]) ** power), 0.0)]
     for potential, q0 in cases[: 3 if power > 1 else 2]:
-        plane = lagjax.System(lambda q, v, potential=potential: 0.5 * v @ v - potential(q))
+        plane = in_potential(potential)
         ts = np.array([0.0, 0.25])
         run = lagjax.simulate(plane, np.array([q0, 0.0]), np.array([0.3, 0.0]), ts)
         np.testing.assert_allclose(run.q[-1], [lagjax.simulate(one, q0, 0.3, ts).q[-1], 0.0], atol=1e-8)
@@ -226,7 +227,7 @@ def test_powers_have_mixed_slopes_where_the_exponent_is_zero(exponent):
     assert derivatives(lambda x: x[0] ** x[1], [0.0, 0.0])[0][0][0] == 0.0
 
 
-@pytest.mark.parametrize("number", sweep(range(60), kept=(19,)))
+@pytest.mark.parametrize("number", sweep(range(3, 60, 4), kept=(19,)))
 def test_random_expressions_agree_with_jax(number):
     scene, verdict, about = expression_population.judge(number, 0, False, 20)
     assert verdict in expression_population.FINE, (scene, verdict, about)
@@ -242,5 +243,5 @@ def test_an_angle_less_whole_turns_is_right_or_nan(u):
         "acos": (lambda q: jnp.arccos(jnp.cos(q)), np.arccos(np.cos(u))),
     }
     for law, exact in laws.values():
-        found = float(lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v, law=law: law(q)).acceleration(u, 0.0))
+        found = float(particle(lambda q, v, law=law: law(q)).acceleration(u, 0.0))
         assert np.isnan(found) if abs(u) > 1e15 else found == pytest.approx(exact, abs=1e-12 + np.spacing(abs(u)))

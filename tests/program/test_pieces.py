@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import in_potential, particle
 
 import lagjax
 
@@ -55,7 +56,7 @@ FAST = ("bits of whole numbers", "odd and even", "the index of the largest", "th
 def test_pieces_by_whole_numbers(name):
     ends = []
     for force in PAIRS[name]:
-        scene = lagjax.System(lambda q, v: 0.5 * v * v, forces=force)
+        scene = particle(force)
         run = lagjax.simulate(scene, 0.83, -0.4, np.array([0.0, 4.0]), solver=lagjax.MachineCode())
         ends.append([float(run.q[-1]), float(run.qdot[-1]), float(run.stats["num_rejected_steps"])])
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)
@@ -65,7 +66,7 @@ def test_pieces_by_whole_numbers(name):
 def test_a_whole_number_beyond_its_type(kind, power):
     """100000² wraps around in 32 bits, as in JAX; its square is more than 53 bits hold, and no other number."""
     force = lambda q, v: 1e-9 * (jnp.floor(q).astype(kind) ** power).astype(float)
-    scene = lagjax.System(lambda q, v: 0.5 * v * v, forces=force)
+    scene = particle(force)
     run = lagjax.simulate(scene, 100_000.5, 0.0, np.array([0.0, 0.1]), throw=False, solver=lagjax.MachineCode())
     if power == 2:
         np.testing.assert_allclose(run.qdot[-1], 0.1e-9 * (100_000**2 % 2**32), rtol=1e-9)
@@ -107,9 +108,8 @@ def test_jumps(name):
     # Both run on their own borders; ends and gradients agree to the tolerance of the runs.
     ends, ts = [], np.array([0.0, 4.0])
     for jump in JUMPS[name]:
-        scene = lagjax.System(
-            lambda q, v: 0.5 * v * v - 0.5 * q * q, forces=lambda q, v, params, jump=jump: -params * jump(2 * q + 0.4)
-        )
+        push = lambda q, v, params, jump=jump: -params * jump(2 * q + 0.4)
+        scene = in_potential(lambda q: 0.5 * q * q, forces=push)
         end = lambda k, scene=scene: lagjax.simulate(scene, 2.0, 0.4, ts, k, solver=lagjax.MachineCode()).q[-1]
         ends.append(jax.jit(jax.value_and_grad(end))(0.3))
     np.testing.assert_allclose(*ends, rtol=1e-7, atol=1e-7)
@@ -141,6 +141,6 @@ def fall_in_order(q, v, forces, end):
 def test_sorted_numbers_that_pass_each_other(tied):
     forces, v = np.array([0.3, 1.2, 2.7, 4.8]), np.array([0.5, -0.5, 1.3, 0.9])
     q = np.full(4, 0.3) if tied else np.array([0.1, -0.1, 0.6, 0.1])
-    row = lagjax.System(lambda q, v: 0.5 * v @ v - jnp.sort(q) @ forces)
+    row = in_potential(lambda q: jnp.sort(q) @ forces)
     run = lagjax.simulate(row, q, v, np.array([0.0, 1.5]))
     np.testing.assert_allclose(run.q[-1], fall_in_order(q, v, forces, 1.5), atol=1e-8)

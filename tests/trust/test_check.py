@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import in_potential
 from sweeps import KINDS, sweep
 
 import lagjax
@@ -297,7 +298,7 @@ DRY = lagjax.System(free, dissipation=lambda q, v: 0.1 * jnp.abs(v))
 @pytest.mark.parametrize("potential, words", [(jnp.abs, "abs at"), (lambda q: jnp.maximum(q, 2 * q), "max at")])
 def test_a_kink_of_the_potential_is_no_error(potential, words):
     """The motion across it is right (`test_borders`); what is computed at this very state is that of one side."""
-    system = lagjax.System(lambda q, v: 0.5 * v**2 - potential(q))
+    system = in_potential(potential)
     finding = only(lagjax.check(system, 0.0, 1.0))
     assert finding.kind == "kink" and finding.level == "advice" and finding.where == ("q",)
     assert words in finding.message and "A motion across it is right" in finding.message

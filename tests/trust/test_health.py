@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import lagrangians
 import numpy as np
 import pytest
-from scenes import BALL, FREE, SPRING, WEIGHT
+from scenes import BALL, FREE, SPRING, WEIGHT, particles
 from sweeps import KINDS, sweep
 
 import lagjax
@@ -183,9 +183,7 @@ def test_a_motion_that_is_small_beside_atol(amplitude):
 def test_work_of_constraints_that_move():
     # A bead on a rod that turns at a given rate: the rod does work; r = cosh(ω t) from rest at 1.
     omega = 0.7
-    bead = lagjax.System(
-        lagrangians.free_particles, constraints=lambda q, t: q[0] * jnp.sin(omega * t) - q[1] * jnp.cos(omega * t)
-    )
+    bead = particles(constraints=lambda q, t: q[0] * jnp.sin(omega * t) - q[1] * jnp.cos(omega * t))
     ts = np.linspace(0.0, 2.0, 41)
     trajectory = lagjax.simulate(bead, np.array([1.0, 0.0]), np.array([0.0, omega]), ts)
     health = trajectory.health()
