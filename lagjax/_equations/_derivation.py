@@ -175,6 +175,19 @@ class Derivation:
             return lower(trace_arrays, *leaves, budget=forms.OPERATION_BUDGET, moving=2 * self.layout.size + 1)
 
     @lowered_once
+    def terms(self) -> Program:
+        """The program of L (), Q (n,) and the constraints (m,), short beside `whole`: M has n² entries."""
+        if self.form.reason is not None:
+            raise Unlowerable(self.form.reason)
+        of = self.motion
+
+        def evaluate(*state):
+            return of.lagrangian(*state), of.nonconservative_force(*state), of.constraints.residual(*state)
+
+        moving = 2 * self.layout.size + 1
+        return lower(evaluate, *self.state_shapes, budget=forms.OPERATION_BUDGET, moving=moving)
+
+    @lowered_once
     def unbalanced_force(self) -> Program:
         """The program of `Motion.unbalanced_force`; its last inputs are q̈ (n,)."""
         if self.form.reason is not None or isinstance(self.motion.forces, CoupledForces):
