@@ -276,10 +276,12 @@ def test_logarithms_of_sums_of_exponentials_are_one_function():
     require_equal(SMOOTH, 0.3, 0.2)
 
 
+LOOKED_UP = lagjax.System(lambda q, v, params: 0.5 * v**2, forces=lambda q, v, params: jnp.interp(q, *params))
+
+
 def test_tables_have_numbers_and_their_ends():
     knots, values = np.array([0.0, 0.5, 2.0]), np.array([1.0, 3.0, 0.0])
-    system = lagjax.System(lambda q, v, params: 0.5 * v**2, forces=lambda q, v, params: jnp.interp(q, *params))
-    equations = system.equations(0.0, 0.0, params=(knots, values))
+    equations = LOOKED_UP.equations(0.0, 0.0, params=(knots, values))
     assert equations.tables == {"table1": "params00 … params02", "table2": "params10 … params12"}
     assert "table1 = params00 … params02" in str(equations)
     known = FUNCTIONS | {"table1": lambda i: knots[int(i)], "table2": lambda i: values[int(i)], "q": 1.1}
