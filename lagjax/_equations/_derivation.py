@@ -371,13 +371,7 @@ class Derivation:
         except Unlowerable:
             return False
         usual = not (program.looks_up or self.has_rules)
-        elimination = 0 if name == "unbalanced_force" else self._elimination
-        return usual and self.layout.dtype == DOUBLE and forms.suits_programs(self, program.operations, elimination)
-
-    @functools.cached_property
-    def _elimination(self) -> int:
-        """The operations, about, of an elimination of M; 0 where M is constant."""
-        return len(self.filled["mass_matrix"]) ** 2 // (3 * self.layout.size) if self.reads("mass_matrix") else 0
+        return usual and self.layout.dtype == DOUBLE and forms.suits_programs(self, program.operations)
 
     @functools.cached_property
     def equations(self) -> int:

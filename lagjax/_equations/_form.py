@@ -142,15 +142,11 @@ def derived_form(motion: Motion, shapes: tuple, path: str, is_sparse_in_scalars:
     return Form("sparse", reason, structure, operations)
 
 
-def suits_programs(derivation: "Derivation", operations: int, elimination: int) -> bool:
-    """True if derivatives are quicker by programs than by the functions as written.
-
-    They take this many `operations`, and those of an `elimination`.
-    """
+def suits_programs(derivation: "Derivation", operations: int) -> bool:
+    """True if derivatives are quicker by programs, of this many operations, than by the functions as written."""
     if operations <= LEAST_AS_ARRAYS or operations > LARGEST_DIFFERENTIATED:
         return operations <= LEAST_AS_ARRAYS
-    of_coordinates = operations + elimination <= MOST_OF_COORDINATE * derivation.layout.size
-    return of_coordinates or operations <= MOST_OF_EQUATION * derivation.equations
+    return operations <= max(MOST_OF_EQUATION * derivation.equations, MOST_OF_COORDINATE * derivation.layout.size)
 
 
 def form_in_xla(derivation: "Derivation") -> Form:
