@@ -15,16 +15,14 @@ from lagjax._equations import (
     Motion,
     Sample,
     Scales,
+    border_places,
     borders_of,
     derivation_of,
     forms,
     has_constraints,
-    pieces_of_motion,
 )
 from lagjax._interface import Layout, as_arrays, is_concrete, require_finite
-from lagjax._program import Unlowerable
 from lagjax._scene import ROLES, System, replace_functions, require_system
-from lagjax._tracing import Program
 
 Vector = Float[Array, " n"]
 
@@ -93,19 +91,11 @@ class SceneState(NamedTuple):
         form = self.derivation.form
         if not form.is_sparse or isinstance(form.mass, MatrixFree) or self.layout.size <= forms.LARGEST_ANALYSED_DENSE:
             return False
-        return not pieces_of_motion(self.motion, *self.derivation.state_shapes)
+        return not border_places(self.motion.functions, *self.derivation.state_shapes)
 
     @property
     def constrained(self) -> bool:
         return has_constraints(self.system)
-
-    @property
-    def terms(self) -> Program | None:
-        """The program `Derivation.terms`; None for a scene on arrays."""
-        try:
-            return self.derivation.terms
-        except Unlowerable:
-            return None
 
     @property
     def piecewise(self) -> bool:
@@ -115,7 +105,7 @@ class SceneState(NamedTuple):
         asking = [role for role in ROLES if (f := getattr(self.system, role)) is not None and "t" in f.extras]
         if not asking:
             return
-        terms = self.terms
+        terms = self.derivation.terms
         if terms is None or 2 * self.layout.size in terms.find_inputs(range(len(terms.line.outputs))):
             raise ValueError(
                 f"{what} is for a scene that does not depend on the time, but {', '.join(asking)} of this one reads t. "
@@ -129,7 +119,7 @@ class SceneState(NamedTuple):
         if self.derivation.form.is_sparse:
             acts = self.constrained or self.motion.forces is not None or self.motion.dissipation is not None
             return () if acts else self.derivation.unread or ()
-        if (terms := self.terms) is None:
+        if (terms := self.derivation.terms) is None:
             return ()
         read, held = (terms.find_inputs(range(first, len(terms.line.outputs))) for first in (0, n + 1))
         return tuple(i for i in range(n) if terms.line.constant(1 + i) == 0 and i not in read and n + i not in held)
@@ -139,7 +129,7 @@ class SceneState(NamedTuple):
         """True if only L acts and is even in velocities, at random states and parameters: a guess to verify."""
         motion, n = self.motion, self.layout.size
         acting = motion.forces, motion.dissipation, self.system.velocity_constraints
-        if any(function is not None for function in acting) or (terms := self.terms) is None:
+        if any(function is not None for function in acting) or (terms := self.derivation.terms) is None:
             return False
         draws = np.random.default_rng(1).uniform(0.3, 1.2, (3, len(self.derivation.scalar_shapes)))
         draws = draws.astype(self.layout.dtype)

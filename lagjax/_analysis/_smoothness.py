@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from lagjax._analysis._scene_state import SceneState
-from lagjax._equations import Derivation, borders, borders_of_motion, pieces_of, pieces_of_motion
+from lagjax._equations import Derivation, border_places, borders
 
 # Where forces are compared, in sizes of a coordinate. A border within the first distance is at the state: equilibria
 # are known to the square root of rounding at worst, to 1e-12 as a rule. Friction that is rounded off over ten times as
@@ -59,7 +59,7 @@ def require_smooth(scene: SceneState, what: str, outputs: Callable | None = None
     for k in np.flatnonzero(rough.jumps | rough.kinks).tolist():
         if outputs is None:
             written = scene.system._motion(scene.layout, scene.params)  # whose lines are to be named
-            pieces = pieces_of_motion(written, *scene.derivation.state_shapes)
+            pieces = border_places(written.functions, *scene.derivation.state_shapes)
             if k >= len(names) // 2:
                 rest = " Dry friction holds a scene at rest: nothing small oscillates."
         operation = [f"{name}{place}" for name, place, size in pieces for _ in range(size)][rough.changed[k].argmax()]
@@ -72,12 +72,12 @@ def require_smooth(scene: SceneState, what: str, outputs: Callable | None = None
 
 
 def _find_pieces(scene: SceneState, outputs: Callable | None) -> list:
-    return _pieces_of_force(scene.derivation) if outputs is None else pieces_of([outputs], *_state_of(scene), ())
+    return _pieces_of_force(scene.derivation) if outputs is None else border_places([outputs], *_state_of(scene), ())
 
 
 @functools.lru_cache(maxsize=64)
 def _pieces_of_force(derivation: Derivation) -> list:
-    return pieces_of_motion(derivation.motion, *derivation.state_shapes)
+    return border_places(derivation.motion.functions, *derivation.state_shapes)
 
 
 def _state_of(scene: SceneState) -> tuple:
@@ -89,9 +89,8 @@ def _measure_roughness(scene: SceneState, outputs: Callable | None) -> _Roughnes
     n, eps = len(q), jnp.finfo(q.dtype).eps
 
     def sides(y):
-        state = y[:n], y[n:], t
-        found = borders_of_motion(scene.motion, *state, numbers) if outputs is None else borders(outputs, *state, ())
-        return jnp.concatenate([jnp.ravel(x) for *_, x in found])
+        functions, params = (scene.motion.functions, numbers) if outputs is None else ([outputs], ())
+        return jnp.concatenate([jnp.ravel(x) for *_, x in borders(functions, y[:n], y[n:], t, params)])
 
     def force(y):
         return scene.force(y[:n], y[n:]) if outputs is None else outputs(y[:n], y[n:], t, ())

@@ -14,15 +14,7 @@ function that are not finite or piecewise, with their source line.
 
 from lagjax._equations import _form as forms
 from lagjax._equations._accelerations import Accelerations
-from lagjax._equations._blame import (
-    borders,
-    borders_of_motion,
-    describe_pieces,
-    offenders,
-    pieces_of,
-    pieces_of_motion,
-    poles,
-)
+from lagjax._equations._blame import border_places, borders, describe_pieces, offenders, poles
 from lagjax._equations._consistency import has_constraints, inconsistent_members, require_consistent
 from lagjax._equations._constraints import ROUNDINGS, Constraints, distances, is_inconsistent
 from lagjax._equations._coupled_forces import CoupledForces, couple_forces

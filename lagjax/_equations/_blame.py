@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core, source_info_util
 
-from lagjax._equations._motion import Motion
 from lagjax._interface import join_names
 from lagjax._program import OPERATIONS
 from lagjax._tracing import apply_in_jax, expand_primitive
@@ -91,8 +90,8 @@ _POWERS = ("pow", "integer_pow")
 _WITH_POLES = frozenset(("div", "sqrt", "rsqrt", "cbrt", "pow", "integer_pow", "log", "log1p", "tan", "atan2", "acos"))
 
 
-def borders(function: Callable, *arguments) -> list[tuple[str, str, Any]]:
-    """The operations that piece `function` together: name, place, and the side on which a state is, traced or not."""
+def borders(functions: Sequence[Callable], *arguments) -> list[tuple[str, str, Any]]:
+    """The operations that piece functions together: name, place, and the side on which a state is, traced or not."""
     collected = []
 
     def visit(equation, operands, moves, results, place):
@@ -107,16 +106,17 @@ def borders(function: Callable, *arguments) -> list[tuple[str, str, Any]]:
             whole = [jnp.ravel(jnp.asarray(x, float)) for x in results if not _floating(x)]
             collected.extend([(name, place, jnp.concatenate(whole))] if whole else [])
 
-    _visit_equations(function, arguments, visit, into_rules=True)
+    for function in functions:
+        _visit_equations(function, arguments, visit, into_rules=True)
     return collected
 
 
-def pieces_of(functions: Sequence[Callable], *arguments) -> list[tuple[str, str, int]]:
+def border_places(functions: Sequence[Callable], *arguments) -> list[tuple[str, str, int]]:
     """The name and place of every border of functions, and how many numbers it compares; nothing is evaluated."""
     collected = []
 
     def traced(*arguments):
-        collected.extend((name, place, np.size(x)) for f in functions for name, place, x in borders(f, *arguments))
+        collected.extend((name, place, np.size(x)) for name, place, x in borders(functions, *arguments))
         return 0.0
 
     jax.eval_shape(traced, *arguments)
@@ -136,19 +136,11 @@ _SIDES = {
 _LOOPS = ("scan", "while", "sort")  # which decide inside: the whole numbers that come out tell on which side
 
 
-def borders_of_motion(motion: Motion, *state) -> list[tuple[str, str, Any]]:
-    """`borders` of L, the forces and the dissipation of a scene."""
-    return [border for function in motion.functions for border in borders(function, *state)]
-
-
-def pieces_of_motion(motion: Motion, *state) -> list[tuple[str, str, int]]:
-    """`pieces_of` L, the forces and the dissipation of a scene."""
-    return pieces_of(motion.functions, *state)
-
-
 def describe_pieces(functions: Sequence[Callable], arguments: tuple) -> str:
     """The operations at which functions are pieced together, and their lines: three at most; empty where none is."""
-    return join_names(list(dict.fromkeys(f"{name}{place}" for name, place, _ in pieces_of(functions, *arguments))), 3)
+    return join_names(
+        list(dict.fromkeys(f"{name}{place}" for name, place, _ in border_places(functions, *arguments))), 3
+    )
 
 
 # ---- following a jaxpr -----------------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from jaxtyping import PyTree
 
 from lagjax._equations import _form as forms
 from lagjax._equations._accelerations import Accelerations, lowered_once
-from lagjax._equations._blame import pieces_of
+from lagjax._equations._blame import border_places
 from lagjax._equations._coupled_forces import CoupledForces
 from lagjax._equations._form import SCALAR, Form, derived_form, form_in_xla
 from lagjax._equations._motion import Motion
@@ -174,18 +174,15 @@ class Derivation:
             self.has_rules = True
             return lower(trace_arrays, *leaves, budget=forms.OPERATION_BUDGET, moving=2 * self.layout.size + 1)
 
-    @lowered_once
-    def terms(self) -> Program:
-        """The program of L (), Q (n,) and the constraints (m,), short beside `whole`: M has n² entries."""
-        if self.form.reason is not None:
-            raise Unlowerable(self.form.reason)
-        of = self.motion
-
-        def evaluate(*state):
-            return of.lagrangian(*state), of.nonconservative_force(*state), of.constraints.residual(*state)
-
-        moving = 2 * self.layout.size + 1
-        return lower(evaluate, *self.state_shapes, budget=forms.OPERATION_BUDGET, moving=moving)
+    @functools.cached_property
+    def terms(self) -> Program | None:
+        """The program of L (), Q (n,) and the constraints (m,), without the n² entries of M; None on arrays."""
+        f, g, h = self.motion.lagrangian, self.motion.nonconservative_force, self.motion.constraints.residual
+        moving, budget = 2 * self.layout.size + 1, forms.OPERATION_BUDGET if self.form.reason is None else 0
+        try:
+            return lower(lambda *x: (f(*x), g(*x), h(*x)), *self.state_shapes, budget=budget, moving=moving)
+        except Unlowerable:
+            return None
 
     @lowered_once
     def unbalanced_force(self) -> Program:
@@ -332,7 +329,7 @@ class Derivation:
     @functools.cached_property
     def kicks(self) -> bool:
         """True if velocities jump at borders, because L, or a speed prescribed by a constraint, jumps."""
-        if not self.motion.constrained and not pieces_of([self.motion.lagrangian], *self.state_shapes):
+        if not self.motion.constrained and not border_places([self.motion.lagrangian], *self.state_shapes):
             return False  # most scenes, and the largest ones, at no cost
         try:
             return self.borders is not None and bool(self.borders.kicking)

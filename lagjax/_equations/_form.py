@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import jax
 
-from lagjax._equations._blame import pieces_of_motion
+from lagjax._equations._blame import border_places
 from lagjax._equations._coupled_forces import CoupledForces
 from lagjax._equations._motion import Motion
 from lagjax._equations._patterns import count_operations
@@ -136,7 +136,7 @@ def derived_form(motion: Motion, shapes: tuple, path: str, is_sparse_in_scalars:
         if isinstance(mass, MatrixFree):
             if not mass.known and is_sparse_in_scalars():
                 return SCALAR
-        elif pieces_of_motion(motion, *shapes):  # steps end at borders there alone
+        elif border_places(motion.functions, *shapes):  # steps end at borders there alone
             return SCALAR
     reason = f"it has {n} coordinates, {structure}, and arrays suit that better"
     return Form("sparse", reason, structure, operations)

@@ -15,7 +15,7 @@ from jax.interpreters.partial_eval import dce_jaxpr
 
 from lagjax._engine import Problem, choose
 from lagjax._engine.taylor import MachineCode
-from lagjax._equations import Derivation, dependent_rows, pieces_of_motion
+from lagjax._equations import Derivation, border_places, dependent_rows
 from lagjax._interface import join_names, show_str
 from lagjax._native import Nesting, is_large, pieces_of
 from lagjax._program import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Unlowerable
@@ -224,7 +224,7 @@ def _border_facts(problem: Problem, inputs: tuple[str, ...]) -> dict[str, Any]:
 def _borders_in_lines(problem: Problem) -> dict[str, Any]:
     # Functions of this very system: its derivation may be that of another one, whose text stands in another line.
     motion = problem.system._motion(problem.layout, problem.params)
-    pieces = pieces_of_motion(motion, *problem.derivation.state_shapes)
+    pieces = border_places(motion.functions, *problem.derivation.state_shapes)
     names = tuple(f"{name}{place}" for name, place, size in pieces for _ in range(size))
     return {"borders": names, "borders_located": not names}
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._equations import borders_of_motion, numbers_of, pieces_of_motion
+from lagjax._equations import border_places, borders, numbers_of
 from lagjax._program import Unlowerable
 from lagjax._tracing import lower
 from lagjax._trust.checks._findings import Finding
@@ -47,9 +47,9 @@ class Discontinuity(NamedTuple):
 
 
 def findings(scene: CheckedScene) -> list[Finding]:
-    if not pieces_of_motion(scene.motion, *scene.state):
+    if not border_places(scene.motion.functions, *scene.state):
         return []
-    pieces, sides = pieces_of_motion(scene.written_motion, *scene.state), _sides_of_states(scene)
+    pieces, sides = border_places(scene.written_motion.functions, *scene.state), _sides_of_states(scene)
     labels = [f"{name}{place}" for name, place, size in pieces for _ in range(size)]
     jumps = [
         _first_jump(scene, sides, scene.point, sign * vector, (name, size), labels)
@@ -65,7 +65,7 @@ def _sides_of_states(scene: CheckedScene) -> Callable:
     n, params = scene.layout.size, scene.state[3]
 
     def sides_at(q, v, t, params):
-        of_motion = borders_of_motion(scene.motion, q, v, t, params)
+        of_motion = borders(scene.motion.functions, q, v, t, params)
         return jnp.concatenate([jnp.ravel(side) for _, _, side in of_motion])
 
     if scene.derivation.is_lowered:

@@ -10,7 +10,7 @@ import numpy as np
 
 from lagjax._engine import Problem
 from lagjax._engine.taylor import Flow, Tolerances, flow_of, portions
-from lagjax._equations import derivation_of, pieces_of_motion
+from lagjax._equations import border_places, derivation_of
 from lagjax._interface import Layout
 from lagjax._native import Crossed
 from lagjax._program import Unlowerable
@@ -65,7 +65,7 @@ def is_piecewise(system: System, layout: Layout, params) -> bool:
     try:
         return derivation.borders is not None and bool(derivation.borders.switches)
     except Unlowerable:  # arrays; as `_explanation` asks
-        return bool(pieces_of_motion(derivation.motion, *derivation.state_shapes))
+        return bool(border_places(derivation.motion.functions, *derivation.state_shapes))
 
 
 def _count_contacts(flow: Flow, ts, y0, params, tolerances: Tolerances, steps, places, into: BorderCounts) -> None:
