@@ -162,7 +162,7 @@ def _scene_at_rest(scene: SceneState, qdot: PyTree) -> SceneState:
 
 def require_steady(scene: SceneState) -> None:
     """Raise `ValueError` if a coordinate that is not cyclic has a velocity."""
-    if not scene.concrete or scene.lowered is None:
+    if not scene.concrete or not np.any(scene.qdot) or scene.derivation.terms is None:
         return
     cyclic = scene.conserved
     if wrong := [scene.layout.names[i] for i in np.flatnonzero(np.asarray(scene.qdot)) if i not in cyclic]:

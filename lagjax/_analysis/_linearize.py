@@ -266,6 +266,8 @@ def linearize(
     of_inputs = None if inputs is None else Layout.from_numbers(inputs, "inputs", layout.dtype)
     pushed = layout.names if of_inputs is None else of_inputs.names
     shown = None if sensor is None else _output_names(sensor, scene, of_inputs is not None)
+    if sensor is not None:
+        require_smooth(scene, "A linearization of outputs", _flat_outputs(sensor, scene, of_inputs, scene.params))
     names = LinearNames(layout.names, tuple(f"u{re.sub('^(q|inputs)', '', name)}" for name in pushed), shown)
     found, of_state = _linearize(of_inputs, sensor, *scene.arguments)
     return Linearization._make((*found, names, *of_state, None if dt is None else _sample(scene, held, of_inputs, dt)))
@@ -305,17 +307,27 @@ def _outputs(sensor: Function, scene: SceneState, driven: bool, q: Vector, qdot:
     return sensor(restore(q), restore(qdot), t=0.0, params=params.params if driven else params, **extras)
 
 
+def _flat_outputs(sensor: Function, scene: SceneState, of_inputs: Layout | None, params: PyTree) -> Callable:
+    """Return the outputs (p,) as a function of (q, q̇, …)."""
+
+    def measure(q, qdot, *_):
+        shown = _outputs(sensor, scene, of_inputs is not None, q, qdot, params)
+        return jnp.concatenate([jnp.ravel(x).astype(q.dtype) for x in jax.tree.leaves(shown)])
+
+    return measure
+
+
 def _output_matrices(of_inputs: Layout | None, sensor: Function | None, scene: SceneState, u: Vector) -> list[Array]:
     """Return C (p, 2n) and D (p, m); without a sensor, of the whole state."""
     if sensor is None:
         return [jnp.eye(2 * scene.q.size, dtype=u.dtype), jnp.zeros((2 * scene.q.size, u.size), u.dtype)]
 
     def measure(q, qdot, u):
-        shown = _outputs(sensor, scene, of_inputs is not None, q, qdot, _driven_params(of_inputs, scene, u))
-        return jnp.concatenate([jnp.ravel(x).astype(q.dtype) for x in jax.tree.leaves(shown)])
+        return _flat_outputs(sensor, scene, of_inputs, _driven_params(of_inputs, scene, u))(q, qdot)
 
+    smooth = is_smooth(scene, _flat_outputs(sensor, scene, of_inputs, scene.params))
     *of_state, d = jax.jacfwd(measure, argnums=(0, 1, 2))(scene.q, scene.qdot, u)
-    return [jnp.hstack(of_state), d]
+    return [nan_unless(smooth, x) for x in (jnp.hstack(of_state), d)]
 
 
 def _driven_params(of_inputs: Layout | None, scene: SceneState, u: Vector) -> PyTree:

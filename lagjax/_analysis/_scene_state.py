@@ -36,6 +36,10 @@ def require_matrices(size: int, what: str, advice: str) -> None:
         )
 
 
+# Roundings of L by which it may change with the signs of velocities: most terms that are even are so exactly.
+_ODD = 1e3
+
+
 class SceneState(NamedTuple):
     """A scene at one state, with its equations as functions of vectors."""
 
@@ -94,20 +98,15 @@ class SceneState(NamedTuple):
         return has_constraints(self.system)
 
     @property
-    def lowered(self) -> Derivation | None:
-        return self.derivation if self.derivation.is_lowered else None
-
-    @property
     def piecewise(self) -> bool:
-        return self.lowered is not None and borders_of(self.derivation) is not None
+        return borders_of(self.derivation) is not None
 
     def require_autonomous(self, what: str) -> None:
         asking = [role for role in ROLES if (f := getattr(self.system, role)) is not None and "t" in f.extras]
         if not asking:
             return
-        derivation, time = self.lowered, 2 * self.layout.size
-        asked = ("lagrangian", "nonconservative_force", "residual", "rates")
-        if derivation is None or any(time in derivation.reads(name) for name in asked):
+        terms = self.derivation.terms
+        if terms is None or 2 * self.layout.size in terms.find_inputs(range(len(terms.line.outputs))):
             raise ValueError(
                 f"{what} is for a scene that does not depend on the time, but {', '.join(asking)} of this one reads t. "
                 "Where a drive turns or moves uniformly, write L in coordinates that move with it."
@@ -116,28 +115,30 @@ class SceneState(NamedTuple):
     @property
     def conserved(self) -> tuple[int, ...]:
         """The coordinates that no function depends on and no force acts on, read off the scene's programs."""
+        n = self.layout.size
         if self.derivation.form.is_sparse:
             acts = self.constrained or self.motion.forces is not None or self.motion.dissipation is not None
             return () if acts else self.derivation.unread or ()
-        if self.lowered is None:
+        if (terms := self.derivation.terms) is None:
             return ()
-        read = set().union(*map(self.derivation.reads, ("lagrangian", "nonconservative_force", "residual")))
-        return tuple(i for i in self.derivation.conserved if i not in read)
+        read, held = (terms.find_inputs(range(first, len(terms.line.outputs))) for first in (0, n + 1))
+        return tuple(i for i in range(n) if terms.line.constant(1 + i) == 0 and i not in read and n + i not in held)
 
     @property
     def reversible(self) -> bool:
-        """True if only L acts and momenta at rest are zero, at random states and parameters: a guess to verify."""
+        """True if only L acts and is even in velocities, at random states and parameters: a guess to verify."""
         motion, n = self.motion, self.layout.size
         acting = motion.forces, motion.dissipation, self.system.velocity_constraints
-        if any(function is not None for function in acting) or self.lowered is None:
+        if any(function is not None for function in acting) or (terms := self.derivation.terms) is None:
             return False
         draws = np.random.default_rng(1).uniform(0.3, 1.2, (3, len(self.derivation.scalar_shapes)))
         draws = draws.astype(self.layout.dtype)
-        draws[:, n : 2 * n] = 0.0
-        sample = Sample.from_states(self.derivation, draws[:, : 2 * n], draws[:, 2 * n], draws[:, 2 * n + 1 :].T)
+        signs = np.where((np.arange(draws.shape[1]) // n) == 1, -1, 1).astype(draws.dtype)
         with np.errstate(all="ignore"):
-            momentum = sample.quantities("momentum")["momentum"]
-        return bool(np.isfinite(momentum).any() and (momentum[np.isfinite(momentum)] == 0).all())
+            ahead, behind = (terms.evaluate_many((sign * draws).T)[0] for sign in (1, signs))
+            even = np.abs(ahead - behind) <= _ODD * np.finfo(ahead.dtype).eps * np.abs(ahead)
+        known = np.isfinite(ahead)
+        return bool(known.any() and even[known].all())
 
     @property
     def scales(self) -> Scales:
@@ -158,12 +159,14 @@ class SceneState(NamedTuple):
 
     def force(self, q: Vector, qdot: Vector) -> Vector:
         """Return F (n,) of M q̈ = F + Gᵀλ."""
-        if self.large:
-            return self.motion.force(q, qdot, jnp.zeros((), q.dtype), self.numbers)
-        return self.motion.mass_matrix_and_force(q, qdot, jnp.zeros((), q.dtype), self.numbers)[1]
+        return -self._unbalanced_force(q, qdot, jnp.zeros_like(q))
 
     def mass_matrix(self, q: Vector, qdot: Vector) -> Float[Array, "n n"]:
-        return self.motion.mass_matrix(q, qdot, jnp.zeros((), q.dtype), self.numbers)
+        _, product = jax.linearize(lambda qddot: self._unbalanced_force(q, qdot, qddot), jnp.zeros_like(q))
+        return jax.vmap(product, out_axes=1)(jnp.eye(q.size, dtype=q.dtype))
+
+    def _unbalanced_force(self, q: Vector, qdot: Vector, qddot: Vector) -> Vector:
+        return self.motion.unbalanced_force(q, qdot, qddot, jnp.zeros((), q.dtype), self.numbers)
 
     def jacobian(self, q: Vector, qdot: Vector) -> Float[Array, "m n"]:
         """Return G (m, n) of the m constraints."""

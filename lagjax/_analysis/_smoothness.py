@@ -6,6 +6,7 @@ may still be smooth there, as max(q, 0)**2 is: its values on both sides decide t
 """
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -35,47 +36,64 @@ class _Roughness(NamedTuple):
     changed: Bool[Array, "2n sides"]
 
 
-def is_smooth(scene: SceneState) -> Bool[Array, ""]:
-    if not _is_pieced(scene.derivation):
+def is_smooth(scene: SceneState, outputs: Callable | None = None) -> Bool[Array, ""]:
+    """True if the force is smooth at the state, or the function `outputs` (q, q̇, t, ()), (p,), instead of it."""
+    if not _find_pieces(scene, outputs):
         return jnp.asarray(True)
-    rough = _measure_roughness(scene)
+    rough = _measure_roughness(scene, outputs)
     return ~jnp.any(rough.jumps | rough.kinks)
 
 
-def require_smooth(scene: SceneState, what: str) -> None:
-    """Raise `ValueError` if the force jumps or has a kink at the state, naming the coordinate and the line."""
-    if not scene.concrete or not _is_pieced(scene.derivation):
+def require_smooth(scene: SceneState, what: str, outputs: Callable | None = None) -> None:
+    """Raise `ValueError` if the force jumps or has a kink at the state, naming the coordinate and the line.
+
+    So it is with `outputs` instead of the force.
+    """
+    if not scene.concrete or not (pieces := _find_pieces(scene, outputs)):
         return
-    rough = jax.tree.map(np.asarray, _measure_roughness(scene))
+    rough = jax.tree.map(np.asarray, _measure_roughness(scene, outputs))
     names = (*scene.layout.names, *(f"d{name}" for name in scene.layout.names))
+    jump, kink, rest = "the force jumps there", "the force has another slope on either side", ""
+    if outputs is not None:
+        jump, kink = "outputs jump there", "outputs have another slope on either side"
     for k in np.flatnonzero(rough.jumps | rough.kinks).tolist():
-        written = scene.system._motion(scene.layout, scene.params)  # whose lines are to be named
-        pieces = list_decisions(written.functions, *scene.derivation.state_shapes)
-        labels = [f"{name}{place}" for name, place, size in pieces for _ in range(size)]
-        operation = labels[int(np.argmax(rough.changed[k]))]
-        how = "the force jumps there" if rough.jumps[k] else "the force has another slope on either side"
-        rest = " Dry friction holds a scene at rest: nothing small oscillates." if k >= len(names) // 2 else ""
+        if outputs is None:
+            written = scene.system._motion(scene.layout, scene.params)  # whose lines are to be named
+            pieces = list_decisions(written.functions, *scene.derivation.state_shapes)
+            if k >= len(names) // 2:
+                rest = " Dry friction holds a scene at rest: nothing small oscillates."
+        operation = [f"{name}{place}" for name, place, size in pieces for _ in range(size)][rough.changed[k].argmax()]
         raise ValueError(
-            f"{what} does not exist at this state, which is on a border along {names[k]}: {how}, at {operation}.{rest} "
+            f"{what} does not exist at this state, which is on a border along {names[k]}: "
+            f"{jump if rough.jumps[k] else kink}, at {operation}.{rest} "
             "Ask for it beside the border, leave the piecewise term out, or round it off (tanh(v / w) for sign(v)). "
             "Motions across the border are right: simulate follows them."
         )
 
 
+def _find_pieces(scene: SceneState, outputs: Callable | None) -> list:
+    return _pieces_of_force(scene.derivation) if outputs is None else list_decisions([outputs], *_state_of(scene), ())
+
+
 @functools.lru_cache(maxsize=64)
-def _is_pieced(derivation: Derivation) -> bool:
-    return bool(list_decisions(derivation.motion.functions, *derivation.state_shapes))
+def _pieces_of_force(derivation: Derivation) -> list:
+    return list_decisions(derivation.motion.functions, *derivation.state_shapes)
 
 
-def _measure_roughness(scene: SceneState) -> _Roughness:
-    q, v, t, numbers = jax.lax.stop_gradient((scene.q, scene.qdot, jnp.zeros((), scene.q.dtype), scene.numbers))
+def _state_of(scene: SceneState) -> tuple:
+    return jax.lax.stop_gradient((scene.q, scene.qdot, jnp.zeros((), scene.q.dtype)))
+
+
+def _measure_roughness(scene: SceneState, outputs: Callable | None) -> _Roughness:
+    (q, v, t), numbers = _state_of(scene), jax.lax.stop_gradient(scene.numbers)
     n, eps = len(q), jnp.finfo(q.dtype).eps
 
     def sides(y):
-        return jnp.concatenate([jnp.ravel(x) for *_, x in find_sides(scene.motion.functions, y[:n], y[n:], t, numbers)])
+        functions, params = (scene.motion.functions, numbers) if outputs is None else ([outputs], ())
+        return jnp.concatenate([jnp.ravel(x) for *_, x in find_sides(functions, y[:n], y[n:], t, params)])
 
     def force(y):
-        return scene.force(y[:n], y[n:])
+        return scene.force(y[:n], y[n:]) if outputs is None else outputs(y[:n], y[n:], t, ())
 
     def sizes(x):
         largest = jnp.max(jnp.abs(x))
@@ -96,10 +114,11 @@ def _measure_roughness(scene: SceneState) -> _Roughness:
 
     def bends(distance):
         ahead, behind, step = steps(distance)
-        return jnp.abs(ahead + behind).max(axis=1) / jnp.where(step > 0, step, 1.0)
+        return jnp.abs(ahead + behind).max(axis=1) / jnp.where(step > 0, step, 1.0), step / distance
 
     is_border, nearest, near = changed.any(axis=1), steps(at)[2], steps(10 * at)[2]
     jump = is_border & (nearest > _STAYS * near) & (nearest > _ROUNDING * eps * steps(1.0)[2].max())
-    bend, nearer = bends(_BESIDE), bends(_BESIDE / 16)
-    kink = is_border & ~jump & (nearer > _STAYS * bend) & (nearer > jnp.maximum(_SLIGHT, jnp.sqrt(eps)))
+    (bend, slope), (nearer, slope_nearer) = bends(_BESIDE), bends(_BESIDE / 16)
+    stays = (nearer > _STAYS * bend) & (slope_nearer > _STAYS * slope)  # of max(q, 0)² both sides have slope zero
+    kink = is_border & ~jump & stays & (nearer > jnp.maximum(_SLIGHT, jnp.sqrt(eps)))
     return _Roughness(jump, kink, changed)

@@ -174,6 +174,16 @@ class Derivation:
             self.has_rules = True
             return lower(trace_arrays, *leaves, budget=forms.OPERATION_BUDGET, moving=2 * self.layout.size + 1)
 
+    @functools.cached_property
+    def terms(self) -> Program | None:
+        """The program of L (), Q (n,) and the constraints (m,), without the n² entries of M; None on arrays."""
+        f, g, h = self.motion.lagrangian, self.motion.nonconservative_force, self.motion.constraints.residual
+        moving, budget = 2 * self.layout.size + 1, forms.OPERATION_BUDGET if self.form.reason is None else 0
+        try:
+            return lower(lambda *x: (f(*x), g(*x), h(*x)), *self.state_shapes, budget=budget, moving=moving)
+        except Unlowerable:
+            return None
+
     @lowered_once
     def unbalanced_force(self) -> Program:
         """The program of `Motion.unbalanced_force`; its last inputs are q̈ (n,)."""

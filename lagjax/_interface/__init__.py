@@ -11,7 +11,7 @@ from lagjax._interface._arguments import (
     Function,
     ValueNotKnown,
     accept,
-    find_params_expression,
+    find_expression,
     present,
     restrict_signature,
 )

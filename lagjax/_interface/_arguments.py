@@ -74,9 +74,10 @@ class Function(eqx.Module):
                     f"{self.name} asks for `params`, and none were given ({reason}): pass params in the structure that "
                     "it reads."
                 ) from reason
-            if asks and (expression := find_params_expression(reason)):
-                given = jax.tree.structure(extras["params"])
-                _add_note(reason, self.name, f"it reads `{expression}`, and the params that it is given are {given}.")
+            for name in [x for x in ("params", "inputs") if x in self.extras]:
+                if expression := find_expression(reason, name):
+                    given = f"the {name} that it is given are {jax.tree.structure(extras[name])}."
+                    _add_note(reason, self.name, f"it reads `{expression}`, and {given}")
             raise
         except KeyError as reason:
             _add_note(reason, self.name, _dict_keys(roles, extras))
@@ -121,10 +122,10 @@ def _dict_keys(roles: tuple, extras: dict[str, Any]) -> str:
     return f"it reads a key that is not there: {keys}."
 
 
-def find_params_expression(reason: Exception) -> str | None:
-    """Return the expression in the failing line of a user's function if it begins with `params`, else None."""
+def find_expression(reason: Exception, name: str) -> str | None:
+    """Return the expression in the failing line of a user's function if it begins with this `name`, else None."""
     _, text = _failing_expression(reason)
-    return text if text.startswith(("params", "(params")) else None
+    return text if text.startswith((name, f"({name}")) else None
 
 
 def _failing_expression(reason: Exception) -> tuple[str, str]:

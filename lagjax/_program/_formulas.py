@@ -18,7 +18,8 @@ from collections import Counter
 from typing import NamedTuple
 
 from lagjax._program._line import StraightLine
-from lagjax._program._operations import OPERATIONS
+from lagjax._program._look_ups import Table, table_of
+from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._simplify import even, odd
 
 Product = tuple[tuple[int, float], ...]  # (atom, power), by atoms
@@ -43,11 +44,13 @@ class Atom(NamedTuple):
 class Formulas:
     """The `outputs` of a line as sums, and the `atoms` that they refer to by index.
 
-    The first `moving` inputs of the line are coordinates, velocities and time; the rest are parameters.
+    The first `moving` inputs of the line are coordinates, velocities and time; the rest are parameters. The position of
+    a look-up is twice that of its table in `tables`, and one more where the table is closed.
     """
 
     def __init__(self, line: StraightLine, moving: int):
         self.moving = moving
+        self.tables: list[Table] = []
         self.atoms: list[Atom] = []
         self._ids: dict[Atom, int] = {}
         self._costs: dict[int, int] = {}
@@ -97,8 +100,11 @@ class Formulas:
             return self._take_power(xs[0], xs[1].get(ONE, 0.0))
         if op == "convert":
             return xs[0] if kind in ("float", "bool") else self._apply_function("trunc", xs)
-        number = int(attribute) if op == "round" else -1 if attribute is None else hash(attribute)
-        return self._apply_function(op, xs, number)
+        if op not in LOOK_UPS:
+            return self._apply_function(op, xs, int(attribute) if op == "round" else -1)
+        if (table := table_of(attribute)) not in self.tables:
+            self.tables.append(table)
+        return self._apply_function(op, xs, 2 * self.tables.index(table) + getattr(attribute, "closed", False))
 
     def _apply_function(self, op: str, xs: list[Sum], number: int = -1) -> Sum:
         xs, sign = [self._shortest_form(x) for x in xs], 1.0

@@ -138,7 +138,7 @@ class _SlidingForces:
         )
         ends = list(map(self.zero_unless, pushed, self.rates))
         missing = coupled.border_residuals(self.graph, self.linear.z, ends)
-        mu = self._solve_shares(coupled.equations, missing)
+        mu = self._solve_shares(coupled.equations, missing, range(len(missing)))
         directions = [self.f("select", p, self.f("neg", x), y) for p, x, y in zip(pushed, missing, mu, strict=True)]
         z = self._solve_system(coupled.add_forces(self.graph, self.linear.right, mu))
         missed = self._constraint_residuals(z)
@@ -276,31 +276,36 @@ class _SlidingForces:
 
     def _pushes_back(self, j: int, effects, pushed: Sequence[int], missing: Sequence[int]) -> int:
         """The flag that border j by position pushes a state next to it back, where no border by velocity holds it."""
-        f, others = self.f, [k for k in range(len(pushed)) if k != j]
-        if all(self.rows.order(k) > 1 for k in others):
+        members = [k for k, group in enumerate(self.groups) if group == self.groups[j]]
+        if all(self.rows.order(k) > 1 for k in members if k != j):
             return pushed[j]
-        without = [p if k != j else f("and", p, f("not", p)) for k, p in enumerate(pushed)]
-        equations = self._share_equations(effects, without, self.slopes)
-        stays = pushed[j]
+        f, at = self.f, {k: i for i, k in enumerate(members)}
+        of_group = [{at[m]: x for m, x in effects[k].items()} for k in members]
+        without = [pushed[k] if k != j else f("and", pushed[k], f("not", pushed[k])) for k in members]
+        equations = self._share_equations(of_group, without, [self.slopes[k] for k in members])
+        stays, acts = pushed[j], [effects[k].get(j) for k in members]
         for change in (self.graph.number(2.0), self.zero):
             beside = [
-                f("sub", x, f("mul", effects[k][j], change)) if j in effects[k] else x for k, x in enumerate(missing)
+                missing[k] if x is None else f("sub", missing[k], f("mul", x, change))
+                for k, x in zip(members, acts, strict=True)
             ]
-            mu = self._solve_shares(equations, list(map(self.zero_unless, without, beside)))
-            for k in others:
-                held = f("lt", f("abs", f("add", mu[k], self.graph.number(self.rows.rows[k].below))), self.one)
-                stays = f("and", stays, f("or", f("not", pushed[k]), held))
-            moves = f("abs", f("sub", beside[j], self._dot_product(drop_entry(effects[j], j), mu)))
+            mu = self._solve_shares(equations, list(map(self.zero_unless, without, beside)), members)
+            for k in members:
+                if k != j:
+                    held = f("lt", f("abs", f("add", mu[at[k]], self.graph.number(self.rows.rows[k].below))), self.one)
+                    stays = f("and", stays, f("or", f("not", pushed[k]), held))
+            others = drop_entry(of_group[at[j]], at[j])
+            moves = f("abs", f("sub", beside[at[j]], self._dot_product(others, mu)))
             own = effects[j].get(j, self.zero)
             stays = f("and", stays, f("le", moves, f("mul", self.graph.number(STILL), f("abs", own))))
         return f("and", pushed[j], f("not", stays))
 
-    def _solve_shares(self, equations: Eliminated, missing: list[int]) -> list[int]:
-        """The solution μ; for dependent borders the one with the smallest distance from the middle, |μ − 1|."""
+    def _solve_shares(self, equations: Eliminated, missing: list[int], members: Sequence[int]) -> list[int]:
+        """The solution μ of rows; for dependent borders the one with the smallest distance from the middle, |μ − 1|."""
         if not equations.whole:
             return equations.solve(self.graph, missing)
         f, rows = self.f, equations.whole
-        below = [self.graph.number(row.below) for row in self.rows.rows]
+        below = [self.graph.number(self.rows.rows[k].below) for k in members]
         there = [f("add", x, self._dot_product(row, below)) for x, row in zip(missing, rows, strict=True)]
         return [f("sub", x, p) for x, p in zip(equations.solve(self.graph, there), below, strict=True)]
 

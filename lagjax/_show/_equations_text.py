@@ -33,6 +33,8 @@ class Equations:
     - `constraints`: what stays zero, by name; `jacobian`: G, by the names of a constraint and a coordinate; `gamma`: γ.
     - `variables`: the names of q, q̇, t and the numbers of params, in this order.
     - `parts`: what `x1`, `x2`, … in these formulas stand for, in the order in which they are computed.
+    - `tables`: the first and the last entry of `table1`, `table2`, …: `table1(i)` is its entry i, and `locate1(x)` the
+      number of its entries that are at most x, less one.
     - `note`: why there are no formulas, where the scene has too many operations for them, or no scalar program.
     - `latex`: all of it in LaTeX.
     """
@@ -43,6 +45,7 @@ class Equations:
     jacobian: dict[tuple[str, str], str] = field(default_factory=dict)
     gamma: dict[str, str] = field(default_factory=dict)
     parts: dict[str, str] = field(default_factory=dict)
+    tables: dict[str, str] = field(default_factory=dict)
     variables: tuple[str, ...] = ()
     note: str = ""
     latex: str = ""
@@ -54,7 +57,7 @@ class Equations:
             return self.note
         of = "M q'' = F + G^T lambda, G q'' = gamma" if self.constraints else "M q'' = F"
         lines = [f"{of}; M is symmetric, and what is not listed is 0.", ""]
-        lines += [f"{name} = {formula}" for name, formula in self.parts.items()]
+        lines += [f"{name} = {formula}" for name, formula in (self.tables | self.parts).items()]
         tables = self.mass_matrix, self.force, self.constraints, self.jacobian, self.gamma
         for title, formulas in zip(("M", "F", "f", "G", "gamma"), tables, strict=True):
             named = ((key if isinstance(key, str) else ", ".join(key), formula) for key, formula in formulas.items())
@@ -117,6 +120,7 @@ class _FormulaPage:
             "jacobian": {(rows[i], of[j]): write(x) for (i, j), x in np.ndenumerate(jacobian) if x},
             "gamma": {rows[i]: write(x) for i, x in enumerate(self.sums["gamma"]) if x},
             "parts": {self.text.parts[atom]: self.text.write_part(atom) for atom in self.shared},
+            "tables": self.text.write_tables(),
         }  # fmt: skip
         return Equations(**each, variables=tuple(name.text for name in self.names), latex=self._write_latex())
 

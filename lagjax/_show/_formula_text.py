@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._program import OPERATIONS, Formulas, Product, Sum
+from lagjax._program import LOOK_UPS, OPERATIONS, Formulas, Product, Sum, Table
 
 LEAST_NAMED = 5  # operations of a part that has a name where it comes twice; sin(a - b) stays where it is
 _SHORT = 6  # digits of a number that is printed as it is; another one is a fraction where that is simple
@@ -103,7 +103,9 @@ class FormulaWriter:
 
     @staticmethod
     def _function_call(atom) -> str:
-        return atom.kind + (str(abs(atom.position) % 1000) if atom.kind in ("take", "locate") else "")
+        if atom.kind not in LOOK_UPS:
+            return atom.kind
+        return f"{'table' if atom.kind == 'take' else 'locate'}{atom.position // 2 + 1}"
 
     def _product_text(self, product: Product, c: float) -> str:
         above, below = _number_text(c) if math.isfinite(c) else (_NOT_FINITE[str(c)][self.style is LATEX], "1")
@@ -140,6 +142,15 @@ class FormulaWriter:
         if power == 0.5:
             return style.root(base)
         return style.power(base, exponent) if exponent else base
+
+    def write_tables(self) -> dict[str, str]:
+        """Return the first and last entries of each table, by its name."""
+        return {f"table{k}": " … ".join(self._ends(table)) for k, table in enumerate(self.formulas.tables, 1)}
+
+    def _ends(self, table: Table) -> list[str]:
+        if table.numbers is not None:
+            return [f"{x:.6g}" for x in table.entries[[0, -1]]]
+        return [self.names[i].text for i in (table.positions[0], table.positions[-1])]
 
     # ---- the order of a textbook ----
 

@@ -53,6 +53,24 @@ def test_modes_of_a_hanging_chain_with_constraints():
     np.testing.assert_allclose(up.exponents[0, 0], np.sqrt(np.linalg.eigvalsh(sideways)[-1]), rtol=1e-12)
 
 
+def beads(q, v):
+    """A string of length one under the tension one, with unit masses."""
+    rise, n = jnp.diff(jnp.concatenate([jnp.zeros(1), q, jnp.zeros(1)])), len(q) + 1
+    return 0.5 * jnp.sum(v**2) - n * jnp.sum(jnp.sqrt(1.0 / n**2 + rise**2))
+
+
+STRING = lagjax.System(beads)
+
+
+@pytest.mark.slow
+def test_modes_of_beads_on_a_string():
+    """The terms of each second derivative cancel to n⁻² away from rest, where patterns of zeros are tested."""
+    n = 250
+    modes = lagjax.normal_modes(STRING, np.zeros(n), count=10)
+    waves = 2 * (n + 1) * np.sin(np.pi * np.arange(1, 11) / (2 * (n + 1)))
+    np.testing.assert_allclose(modes.frequencies, waves, rtol=1e-10)
+
+
 def phi4(q, v):
     return ring(q, v) - 0.25 * jnp.sum((q**2 - 1) ** 2)
 

@@ -28,6 +28,7 @@ def tip(q, v):
 
 CART, PUSHED = lagjax.System(cart, forces=push), {"f": 0.0}
 TOP, M = {"a": 0.0, "x": 0.0}, {"M": 2.0}
+FREE = lagjax.System(lambda q, v: 0.5 * v**2)
 PLAIN = lagjax.System(cart, dissipation=lambda q, v: 0.05 * v["a"] ** 2)
 ROD_OF_LENGTH = lagjax.System(lambda q, v: 0.5 * v @ v - G * q[1], constraints=lambda q, params: q @ q - params**2)
 ROD = lagjax.System(lambda q, v: 0.5 * v @ v - G * q[1], constraints=lambda q: q @ q - L**2)
@@ -155,6 +156,15 @@ def test_transformations():
     np.testing.assert_allclose(single.Gamma, sample(2.0)[-4:, None], rtol=1e-5)
 
 
+def test_outputs_at_a_kink_or_a_jump():
+    for outputs, words in ((lambda q, v: jnp.abs(q), "another slope"), (lambda q, v: (9.0 * q, jnp.sign(v)), "jump")):
+        with pytest.raises(ValueError, match=rf"outputs does not exist .*{words}.* at .*test_linearize\.py"):
+            lagjax.linearize(FREE, 0.0, outputs=outputs)
+        found = jax.jit(lambda q, v, of=outputs: lagjax.linearize(FREE, q, v, outputs=of).C)
+        assert np.isnan(found(0.0, 0.0)).all() and np.isfinite(found(0.1, 0.1)).all()
+    np.testing.assert_array_equal(lagjax.linearize(FREE, 0.0, outputs=lambda q, v: jnp.maximum(q, 0) ** 2).C, 0)
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
@@ -170,6 +180,13 @@ def test_wrong_arguments(arguments, sentence):
     with pytest.raises((TypeError, ValueError)) as error:
         lagjax.linearize(CART, TOP, params=M, **arguments)
     assert sentence in str(error.value)
+
+
+@pytest.mark.parametrize("inputs", [0.0, {"g": 0.0}])
+def test_inputs_of_another_structure_are_told_with_what_reads_them(inputs):
+    with pytest.raises((TypeError, KeyError)) as error:
+        lagjax.linearize(CART, TOP, params=M, inputs=inputs)
+    assert "push" in error.value.__notes__[0] and "inputs" in error.value.__notes__[0]
 
 
 MOVED = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q, inputs: q[0] - inputs)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import lagrangians
 import numpy as np
 import pytest
+import scipy.linalg
 from scenes import PENDULUM, PENDULUM_G, RAMP
 from scipy.special import roots_laguerre
 from sweeps import sweep
@@ -199,6 +200,29 @@ def test_hanging_chain_of_beads(n):
 
 
 @pytest.mark.slow
+def angles_of_a_chain(q, qdot):
+    """Equal links and masses: L in absolute angles, with a dense mass matrix."""
+    sideways, upwards = jnp.cumsum(jnp.cos(q) * qdot), jnp.cumsum(jnp.sin(q) * qdot)
+    return 0.5 * jnp.sum(sideways**2 + upwards**2) + G * jnp.sum(jnp.cumsum(jnp.cos(q)))
+
+
+ANGLES = lagjax.System(angles_of_a_chain)
+
+
+@pytest.mark.parametrize("n", [6, pytest.param(100, marks=pytest.mark.slow)])
+def test_a_chain_of_pendulums_in_angles(n):
+    """Equal angles and a curve of angles, against M and K that are written by hand."""
+    hanging = np.arange(n, 0.0, -1.0)
+    squares = scipy.linalg.eigh(np.diag(G * hanging), np.minimum.outer(hanging, hanging), eigvals_only=True)
+    modes = lagjax.normal_modes(ANGLES, np.zeros(n))
+    np.testing.assert_allclose(modes.frequencies, np.sqrt(squares), rtol=1e-11)
+    assert modes.shapes.dtype == float and modes.stable
+    found = lagjax.linearize(ANGLES, np.zeros(n)).A[n:, :n]
+    np.testing.assert_allclose(np.sort(np.linalg.eigvals(-found).real), squares, rtol=1e-9)
+    rest = lagjax.equilibrium(ANGLES, 0.01 * np.cos(np.arange(n)))
+    np.testing.assert_allclose(rest.q, 0, atol=1e-12)
+
+
 def test_equal_frequencies_have_derivatives():
     total = lambda params: lagjax.normal_modes(PLANE, jnp.zeros(2), params).frequencies.sum()
     both = np.array([2.0, 2.0, 0.0])
@@ -348,6 +372,13 @@ def test_nothing_is_linear_at_a_border(name):
             function(system, 0.0)
     assert np.isnan(jax.jit(lambda q: lagjax.normal_modes(system, q).frequencies)(0.0)).all()
     assert np.isnan(jax.jit(lambda q: lagjax.linearize(system, q).A)(0.0)[1]).all()
+
+
+BEGINS = lagjax.System(lambda q, qdot: 0.5 * qdot**2, forces=lambda q, qdot: -(jnp.maximum(q, 0.0) ** 2))
+
+
+def test_a_force_that_begins_without_a_slope_is_smooth():
+    np.testing.assert_array_equal(lagjax.linearize(BEGINS, 0.0).A, [[0, 1], [0, 0]])
 
 
 @pytest.mark.parametrize(

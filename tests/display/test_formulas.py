@@ -276,6 +276,22 @@ def test_logarithms_of_sums_of_exponentials_are_one_function():
     require_equal(SMOOTH, 0.3, 0.2)
 
 
+LOOKED_UP = lagjax.System(lambda q, v, params: 0.5 * v**2, forces=lambda q, v, params: jnp.interp(q, *params))
+
+
+def test_tables_have_numbers_and_their_ends():
+    knots, values = np.array([0.0, 0.5, 2.0]), np.array([1.0, 3.0, 0.0])
+    equations = LOOKED_UP.equations(0.0, 0.0, params=(knots, values))
+    assert equations.tables == {"table1": "params00 … params02", "table2": "params10 … params12"}
+    assert "table1 = params00 … params02" in str(equations)
+    known = FUNCTIONS | {"table1": lambda i: knots[int(i)], "table2": lambda i: values[int(i)], "q": 1.1}
+    known["locate1"] = lambda x: np.searchsorted(knots, x, side="right") - 1.0
+    known |= zip(equations.variables[-6:], [*knots, *values], strict=True)
+    for name, text in equations.parts.items():
+        known[name] = eval(text, known)
+    np.testing.assert_allclose(eval(equations.force["q"], known), np.interp(1.1, knots, values), rtol=1e-15)
+
+
 def test_a_notebook_shows_them_in_latex():
     text = DOUBLE_PENDULUM.equations(ANGLES, ANGLES, params=DOUBLE)._repr_latex_()
     assert text.startswith("$$\n\\begin{aligned}") and text.endswith("\\end{aligned}\n$$")

@@ -25,7 +25,7 @@ from lagjax._fit.model._sensor_faults import constant_signals, require_measureme
 from lagjax._fit.model._sensors import Delayed, require_no_jumps, sensors
 from lagjax._fit.model._signals import Signals
 from lagjax._fit.model._timings import Clock, Timings, build_clock
-from lagjax._interface import Layout, find_params_expression
+from lagjax._interface import Layout, find_expression
 from lagjax._primitives import DOUBLE
 from lagjax._run.hybrid import Scene, first_law, may_jump, require_scene
 
@@ -158,7 +158,7 @@ def _read_layout(system: Scene, records: list[Record], params0, form: InputForm 
         jax.eval_shape(lambda q, qdot: scene.energy(q, qdot, 0.0, params), q, qdot)
     except Exception as reason:
         said = f"({type(reason).__name__}: {str(reason).splitlines()[0]})"
-        if where := find_params_expression(reason):
+        if where := find_expression(reason, "params"):
             given = jax.tree.structure(plain_dicts(params0))
             text = f"ask for `{where}`, which params0 does not have {said}: params0 is {given}."
         elif place is not None:
