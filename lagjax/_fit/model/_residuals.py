@@ -244,8 +244,7 @@ class SystemResiduals:
         return motion
 
     def _directions(self, batch: Samples, trial: _SystemTrial) -> tuple[np.ndarray, np.ndarray]:
-        """Directions of the starts (N, D, 2n) and of the parameters (N, D, P): D = 2n + L, or L where no start is
-        free."""
+        """Directions of starts (N, D, 2n) and parameters (N, D, P). D = 2n + L, or L where no start is free."""
         directions, states = trial.directions[batch.rows], self.states if self.fitted[batch.rows].any() else 0
         y0_dot = np.zeros((len(batch.rows), states + directions.shape[1], self.states))
         y0_dot[:, :states] = np.eye(states, self.states)
@@ -539,7 +538,7 @@ class Residuals:
         return found
 
     def count_runs_once(self, point: Trial, noise: NoiseScale) -> "Residuals":
-        """The same residuals, where samples that share a rounding error have together the weight of one."""
+        """A copy of the residuals in which samples that share a rounding error together have the weight of one."""
         other, weights = copy.copy(self), [batch.weights.copy() for batch in self.batches]
         for s in np.flatnonzero(np.isfinite(self.sensor.step)).tolist():
             each = self.worths(point, noise, s)
