@@ -178,7 +178,7 @@ def _co_rotating_frame(a: Array, rows: Array, qdot: Vector, moves: Array, turns:
 
 @compile_for_one_call
 def _reduced_fields(rank: int, rows: Array, a: Array, b: Array, c: Array, d: Array, sampled: tuple | None) -> tuple:
-    """The fields of a `ReducedLinearization` to what the `rows`, of this rank, send to zero."""
+    """The fields of a `ReducedLinearization` onto the null space of `rows`, which have this `rank`."""
     basis = tangent_basis(rows, rank)
     inverse = factorize(basis.T @ basis).solve_columns(basis.T)  # orthonormal columns, but for derivatives
     phi, gamma = (None, None) if sampled is None else (inverse @ sampled[0] @ basis, inverse @ sampled[1])

@@ -122,7 +122,7 @@ def _differing_rows(values, rows, factors, products, dtype) -> np.ndarray:
 
 
 def _unroll_calls(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
-    """The same jaxpr without calls, with loop bodies inlined and known numbers computed."""
+    """A jaxpr's equivalent without calls, with loop bodies inlined and known numbers computed."""
     return _compute_known(jax.make_jaxpr(lambda *x: _evaluate_jaxpr(closed.jaxpr, closed.consts, x))(*closed.in_avals))
 
 
@@ -151,7 +151,7 @@ def _unroll_jaxprs(x):
 
 
 def _compute_known(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
-    """The same jaxpr with operations on constants computed, by XLA instead of NumPy."""
+    """A jaxpr with operations on constants computed, by XLA instead of NumPy."""
     jaxpr, known, equations, others = closed.jaxpr, set(closed.jaxpr.constvars), [], []
     for equation in jaxpr.eqns:
         is_known = not equation.effects and all(isinstance(x, core.Literal) or x in known for x in equation.invars)

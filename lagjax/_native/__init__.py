@@ -43,5 +43,5 @@ from lagjax._native.motions._line_handler import LineCode, compilation_work, lin
 from lagjax._native.series._guards import Guards, append_guards
 from lagjax._native.series._motion_parts import Projection, pieces_of, recurrences
 from lagjax._native.series._taylor import choose_order, is_large
-from lagjax._native.steps._watch import BorderKind
+from lagjax._native.steps._watch import StepEnd
 from lagjax._program import Nesting

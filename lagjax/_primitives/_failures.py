@@ -102,10 +102,6 @@ def _lower_check(call: Callable):
     return mlir.lower_fun(check, multiple_results=True)
 
 
-def _call_on_buffers(host, shape, *arrays):
-    return buffer_callback(lambda _, place, *arrays: host(*arrays), shape)(*arrays)
-
-
 NOT_EXPORTED = (
     "jax.export cannot take {} along: give a solver of diffrax and leave the error out, as "
     "simulate(…, solver=diffrax.Dopri8(), throw=False), and set EQX_ON_ERROR=nan in the environment before Python "
@@ -126,7 +122,13 @@ def _lower_callback(rule: Callable, what: str, in_exports: bool = False):
 
 _RAISES = "an error that is raised at run time, as with throw=True,"
 mlir.register_lowering(check_p, _lower_callback(_lower_check(jax.pure_callback), _RAISES))
-mlir.register_lowering(check_p, _lower_callback(_lower_check(_call_on_buffers), _RAISES), platform="cpu")
+mlir.register_lowering(
+    check_p,
+    _lower_callback(
+        _lower_check(lambda host, shape, *xs: buffer_callback(lambda _, __, *ys: host(*ys), shape)(*xs)), _RAISES
+    ),
+    platform="cpu",
+)
 
 # The steps of diffrax have checks of equinox, which call back to the host as well, but for EQX_ON_ERROR=nan.
 steps_p = LinearMap("lagjax_steps", lambda ended: [ended], vary=lambda *_, **__: [None])

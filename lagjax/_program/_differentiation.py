@@ -377,7 +377,7 @@ def gradient_in(graph: Graph, line: Any, nodes: list[int], node: int, by: Sequen
 
 
 def slopes_in(graph: Graph, line: Any, nodes: Sequence[int], node: int, by: Container[int]) -> dict[int, int]:
-    """As `gradient_in`, as {input: derivative}, for those of the inputs `by` on which the node depends."""
+    """The derivatives {input: node} of one `node` by those of the inputs `by` on which it depends."""
     return _PlacedLine(graph, line, nodes).pull({node: graph.number(1.0)}, by)
 
 

@@ -151,7 +151,10 @@ class JumpSearch:
         """States on borders with the pieces of both sides (inputs, S), a mask (S,), the slice of each candidate."""
         m, size = self.m, self.size
         columns, given = self._draw_states(_STATES * len(candidates)), np.repeat(candidates, _STATES)
-        lines, target = [self._switching_distance(j) for j in candidates], np.full((3, len(given)), np.nan)
+        lines, target = [], np.full((3, len(given)), np.nan)
+        for j in candidates:  # switching number j, its rounding error, and its derivatives by q, q̇ and t
+            line = eliminate_dead_code(self.line, [self.decisions[j].switch])
+            lines.append(self._add_rounding(line, 1, range(self.moving)))
         blocks = [slice(k * _STATES, (k + 1) * _STATES) for k in range(len(candidates))]
         for turn in range(_ROUNDS):
             columns[size : size + m] = self._decide_pieces(columns, given, np.full(len(given), np.nan))
@@ -187,11 +190,6 @@ class JumpSearch:
         sides = BothSides(graph, self.line, self.size, self.m)
         changes = [sides.difference(i) for i in nodes]
         return self._add_rounding(eliminate_dead_code(graph, changes), len(changes))
-
-    def _switching_distance(self, j: int) -> StraightLine:
-        """The line of switching number j, its rounding error, and its derivatives by q, q̇ and t."""
-        line = eliminate_dead_code(self.line, [self.decisions[j].switch])
-        return self._add_rounding(line, 1, range(self.moving))
 
     def _add_rounding(self, line: StraightLine, count: int, by: Sequence[int] = ()) -> StraightLine:
         graph = Graph(_LARGEST_SEARCH * len(line.nodes) + 10_000)

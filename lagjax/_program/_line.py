@@ -78,7 +78,8 @@ class StraightLine:
         columns, precision, count = self._prepare_columns(columns)
         states = max([count, *[np.size(x) for x in cotangents]])
         inputs: list = [None] * len(columns)
-        for part in self._line_parts(states):
+        size = max(1, min(CHUNK, _MOST_KEPT // (1 + len(self.nodes))))
+        for part in (slice(start, min(start + size, states)) for start in range(0, states, size)):
             values = _node_values(self._numpy_steps(precision), [_cut(x, part) for x in columns], keep=True)
             flows: dict[int, Any] = {}
             for i, cotangent in zip(self.outputs, cotangents, strict=True):
@@ -106,10 +107,6 @@ class StraightLine:
         for i, partial in zip(operands, OPERATIONS[op].transpose() if operands else (), strict=False):
             if partial is not None and self.kinds[i] == "float" and self.nodes[i][0] != "constant":
                 yield i, lambda x, partial=partial: partial(apply_in_numpy, float, x, values[k], *of)
-
-    def _line_parts(self, states: int) -> list[slice]:
-        size = max(1, min(CHUNK, _MOST_KEPT // (1 + len(self.nodes))))
-        return [slice(start, min(start + size, states)) for start in range(0, states, size)]
 
     # ---- what is derived from it ----
 

@@ -38,14 +38,7 @@ from lagjax._sweep._job import Job, set_precision
 from lagjax._sweep._members import axes_of
 from lagjax._sweep._statistics import Statistics, Summary, merge_statistics, statistics_from_bytes, summarize
 from lagjax._sweep._status import Progress, Status, read_status
-from lagjax._sweep._workers import (
-    compute_units,
-    require_executor,
-    require_part,
-    run_store,
-    submit_units,
-    units_to_compute,
-)
+from lagjax._sweep._workers import compute_units, require_executor, require_part, run_store, submit, units_to_compute
 
 
 @dataclass(frozen=True)
@@ -280,7 +273,7 @@ def sweep(
         job = Job.from_store(place, spec, description, *compiled)
         show, units = Progress(place, spec, progress), units_to_compute(job, part)
         if executor is not None:
-            submit_units(job, units, executor, show)
+            submit(job, units, executor, show)
         else:
             compute_units(job, units, show)
     show.end()

@@ -159,7 +159,7 @@ def split_unit(job: Job, unit: int) -> list[tuple[np.ndarray, int]]:
     return [(members[np.minimum(np.arange(k, k + batch), last)], min(batch, len(members) - k)) for k in firsts]
 
 
-def unit_points(job: Job, unit: int) -> Callable[[np.ndarray], dict[str, np.ndarray]]:
+def find_unit_points(job: Job, unit: int) -> Callable[[np.ndarray], dict[str, np.ndarray]]:
     axes, shape = job.store.coordinates(job.spec["axes"], job.grid.box(unit)), job.grid.box_shape(unit)
     starts = job.store.read_copied(unit).starts
     return lambda which: points_of(axes, shape, which) | {name: x[which] for name, x in starts.items()}
@@ -167,7 +167,7 @@ def unit_points(job: Job, unit: int) -> Callable[[np.ndarray], dict[str, np.ndar
 
 def compute_unit(job: Job, unit: int) -> Unit:
     began, spent = time.monotonic(), time.process_time()
-    size, points, copied = job.grid.unit_size(unit), unit_points(job, unit), job.store.read_copied(unit)
+    size, points, copied = job.grid.unit_size(unit), find_unit_points(job, unit), job.store.read_copied(unit)
     drifts, complaints = np.full(size, np.nan), {}
     values = {q.name: np.full((size, *q.shape), q.filling, q.dtype) for q in (*job.batches.quantities, RESULT)}
     result = values[RESULT.name]

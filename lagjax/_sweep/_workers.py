@@ -84,7 +84,7 @@ _WINDOW = 64  # units that an executor is given at a time: a scheduler holds thi
 _POLL = 0.2  # seconds between two looks at tasks that are no futures
 
 
-def submit_units(job: Job, units: list[int], executor: Any, notify: Notify) -> None:
+def submit(job: Job, units: list[int], executor: Any, notify: Notify) -> None:
     """Compute these units by an executor; raise what a task raises, `RuntimeError` if a worker has died."""
     path, remaining, running = str(job.store.path.resolve()), iter(units), set()
     try:

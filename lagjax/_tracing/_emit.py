@@ -68,7 +68,7 @@ class Rows(NamedTuple):
 
 
 def emit_rows(line: StraightLine, rows: Rows) -> tuple:
-    """As `emit`, for inputs in arrays, which are not split into scalars for look-ups."""
+    """The outputs of a line for inputs in arrays, which look-ups read without splitting them into scalars."""
     shape = jnp.broadcast_shapes(rows.first.shape[:-1], rows.numbers.shape[:-1])
     return _emit_outputs(line, rows, shape, rows.entries)
 

@@ -58,11 +58,9 @@ def _first_scalars(xs: Sequence) -> Scalars:
     return next(x for x in xs if isinstance(x, Scalars))
 
 
-def _function(op: str) -> Callable[..., Scalars]:
-    return lambda *xs: _first_scalars(xs).map(op, *xs)
-
-
-binade, prefers, logarithm, root, maximum, absolute = map(_function, ("binade", "prefers", "log", "sqrt", "max", "abs"))
+binade, prefers, logarithm, root, maximum, absolute = (
+    lambda *xs, op=op: _first_scalars(xs).map(op, *xs) for op in ("binade", "prefers", "log", "sqrt", "max", "abs")
+)
 
 
 def where(condition, yes, no) -> Scalars:

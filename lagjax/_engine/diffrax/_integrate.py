@@ -25,13 +25,7 @@ from jaxtyping import PyTree
 
 from lagjax._engine._problem import Solution
 from lagjax._engine.diffrax._equations import MotionEquations
-from lagjax._engine.diffrax._jumps import (
-    AdaptiveJumpRecorder,
-    AdaptiveWrapper,
-    JumpRecorder,
-    may_jump,
-    stop_derivatives,
-)
+from lagjax._engine.diffrax._jumps import AdaptiveRecorder, AdaptiveWrapper, JumpRecorder, may_jump, stop_derivatives
 from lagjax._engine.diffrax._solvers import Projected
 from lagjax._interface import ENDED_WELL, RESULTS, SUCCESSFUL, code_of, halves
 from lagjax._primitives import differentiable_where, vary_alike
@@ -117,7 +111,7 @@ def _record_jumps(moving, method: Stepping, varied) -> Stepping:
     field, _, _, _, params = moving
     varied = jax.tree.map(lambda _: False, (field, params)) if varied is None else varied
     adaptive = isinstance(method.controller, diffrax.AbstractAdaptiveStepSizeController)
-    noting: Any = AdaptiveJumpRecorder if adaptive else JumpRecorder
+    noting: Any = AdaptiveRecorder if adaptive else JumpRecorder
     return eqx.tree_at(lambda m: m.controller, method, noting(method.controller, field, varied))
 
 

@@ -150,5 +150,5 @@ class JumpRecorder(diffrax.AbstractStepSizeController):
         return keep, *more, (state, crossed | here), result
 
 
-class AdaptiveJumpRecorder(JumpRecorder, AdaptiveWrapper):
+class AdaptiveRecorder(JumpRecorder, AdaptiveWrapper):
     """`JumpRecorder` of a controller whose steps adapt."""

@@ -68,7 +68,8 @@ def jvp(flow: Flow, motions: Motions, dy0, dparams, tolerances: Tolerances) -> t
     members, m = dy0.shape[:2]
     if flow.projection is not None:
         dy0 = project_start_tangents(flow.projection, ts[:, :1], y0, params, dy0, dparams)
-    groups = _direction_group_count(members, m)
+    lanes = _native.lanes()  # of few members, one row of directions per thread or more
+    groups = max(1, min(_native.cores() // members, math.ceil(m / lanes))) if members < lanes else 1
     directions = math.ceil(m / groups)
     padding = ((0, 0), (0, groups * directions - m), (0, 0))
     padded = (np.pad(x, padding).reshape(members * groups, directions, -1) for x in (dy0, dparams))
@@ -99,14 +100,8 @@ def start_outputs(ts, dy0, path_dot, library: Any = np):
     return library.where((ts == ts[:, :1])[:, None, :, None], dy0[:, :, None], path_dot)
 
 
-def _direction_group_count(members: int, m: int) -> int:
-    """The number of rows into which the m directions of a member are split: for few members, one per thread or more."""
-    lanes = _native.lanes()
-    return max(1, min(_native.cores() // members, math.ceil(m / lanes))) if members < lanes else 1
-
-
 def _jvp_over_steps(flow: Flow, motions: Motions, dots, tolerances) -> tuple[np.ndarray, np.ndarray]:
-    """As `jvp`, for a group of directions per row, over recorded steps."""
+    """The tangents of `jvp` over recorded steps, for a group of directions per row."""
     dy0, dparams = dots
     y_dot = np.array(dy0, np.float64)
     path_dot = np.full((*dy0.shape[:2], *motions.path.shape[1:]), np.nan)
@@ -179,7 +174,7 @@ def transpose_outputs(go_back: Callable, ts, path_ct, end_ct, library: Any = np)
 
 
 def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -> tuple[np.ndarray, np.ndarray]:
-    """As `vjp`, for one cotangent per row, over recorded steps."""
+    """The cotangents of `vjp` over recorded steps, for one cotangent per row."""
     y_ct, params_ct = np.full(end_ct.shape, np.nan), np.full((len(end_ct), flow.numbers), np.nan)
     inputs = flow.states + flow.numbers
     directions = np.random.default_rng(0).normal(size=(1, inputs))
@@ -215,7 +210,7 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
 
 
 def _vjp_by_jacobian(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -> tuple[np.ndarray, np.ndarray]:
-    """As `vjp`, from the whole Jacobian: for more cotangents than inputs, and for a flow that `turns`."""
+    """The cotangents of `vjp` by the whole Jacobian. For more cotangents than inputs, and for a flow that `turns`."""
     inputs = flow.states + flow.numbers
     unit = np.broadcast_to(np.eye(inputs), (len(end_ct), inputs, inputs))
     path, end = jvp(flow, motions, unit[..., : flow.states], unit[..., flow.states :], tolerances)

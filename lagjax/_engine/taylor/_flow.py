@@ -188,7 +188,7 @@ class Flow:
         return solution
 
     def run_and_record(self, ts, y0, params, tolerances, room: int = 0, begun=None) -> tuple[Solution, list[Steps]]:
-        """As `run`, without analysis of what stopped a member; and the recorded steps of members, up to `room`."""
+        """The solution of N members, as by `run` but with raw result codes; and their recorded steps, up to `room`."""
         rtol, atol, max_steps, notes, order = *tolerances[:3], tolerances.notes, tolerances.order
         done = self.kernel.select_width(len(y0))(ts, y0, params, rtol, atol, max_steps, room, begun, notes, order)
         result, found = RESULT_OF_CODE[done.code], []

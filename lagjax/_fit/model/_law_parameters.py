@@ -86,7 +86,7 @@ def find_laws(params: PyTree) -> list[FoundLaw]:
 
 
 def plain_dicts(params: PyTree) -> PyTree:
-    """The same pytree with plain dicts in place of the parameters of laws, its leaves in the same order."""
+    """A copy of a pytree with plain dicts for the parameters of laws, its leaves in the same order."""
 
     def replace_law(branch):
         return {name: plain_dicts(value) for name, value in branch.items()} if _is_law(branch) else branch

@@ -356,7 +356,7 @@ def _steepness(column: np.ndarray, first: int, run: int, step: float) -> float:
 
 
 def find_sensor(records: list[Record]) -> Sensor:
-    """The sensors as records show them: rounding that all of them share, and limits that some of them reach."""
+    """The sensors that the values show: a rounding step common to all records, and limits that some reach."""
     columns = [np.concatenate([r.matrix[:, s] for r in records]) for s in range(records[0].matrix.shape[1])]
     columns = [column[np.isfinite(column)] for column in columns]
     steps = np.array([find_step(column) for column in columns])
@@ -368,8 +368,10 @@ def find_sensor(records: list[Record]) -> Sensor:
 
 
 def read_sensor(records: list[Record], noise: AbstractNoise, names: tuple[str, ...], periods: np.ndarray) -> Sensor:
-    """The sensors as the law says and, where it says nothing, as the records show; wrapped signals have no limits,
-    Student's t knows none. Raises `ValueError` where values contradict the law."""
+    """The sensors by the law and, if it states none, by the records.
+
+    Wrapped signals have no limits, Student's t knows none. Raises `ValueError` where values contradict the law.
+    """
     if not records:
         return Sensor(*np.zeros((3, 0)))
     found, given = find_sensor(records), noise.sensor(records)

@@ -246,7 +246,7 @@ class Parameters:
         return np.concatenate([np.zeros(0), *each])
 
     def replace_strengths(self, strengths: dict[str, float]) -> "Parameters":
-        """The same with other strengths of the priors of learned functions, by the labels of their leaves."""
+        """A copy with new strengths of the priors of learned functions, by the labels of their leaves."""
         parts = []
         for part in self.parts:
             if isinstance(part.transform, Smooth):

@@ -348,7 +348,7 @@ def _require_same_signals(placed: list[tuple[int, Record]]) -> None:
 
 
 def known_start(record: MeasuredSignal, layout: Layout, place: int, params: PyTree) -> np.ndarray | None:
-    """The state (2n,) that a record says it starts from, known, guessed or of `params`; None where it says nothing."""
+    """The start state (2n,) that a record gives: known, guessed or a function of `params`; None if it gives none."""
     if record.begins is None:
         return None
     q, qdot = start_pair(record.begins, params)

@@ -330,8 +330,8 @@ class SystemResiduals:
         return np.array([self.modes[row][0] if self.modes[row] else self.scene.first for row in rows])
 
     def _directions(self, batch: Samples, trial: _SystemTrial) -> tuple[np.ndarray, np.ndarray]:
-        """Directions of the starts (N, D, 2n) and of the parameters (N, D, P): D = 2n + L, or L where no start is
-        free, or 0 without derivatives."""
+        """Directions of starts (N, D, 2n) and parameters (N, D, P). D = 2n + L, L where no start is free, 0 without
+        derivatives."""
         if trial.directions is None:
             return np.zeros((len(batch.rows), 0, self.states)), trial.numbers[batch.rows, None][:, :0]
         directions, states = trial.directions[batch.rows], self.states if self.fitted[batch.rows].any() else 0
@@ -689,7 +689,7 @@ class Residuals:
         return found
 
     def count_runs_once(self, point: Trial, noise: NoiseScale) -> "Residuals":
-        """The same residuals, where samples that share a rounding error have together the weight of one."""
+        """A copy of the residuals in which samples that share a rounding error together have the weight of one."""
         other, weights = copy.copy(self), [batch.weights.copy() for batch in self.batches]
         for s in np.flatnonzero(np.isfinite(self.sensor.step)).tolist():
             each = self.worths(point, noise, s)

@@ -52,8 +52,10 @@ class SmoothPart(NamedTuple):
 
 
 def begin_weakly(residuals: Residuals, point: Point, law: AbstractNoise) -> Residuals:
-    """The residuals with priors that are weak beside what data say at a point, in any units; unchanged without priors
-    and where no motion can be followed."""
+    """The residuals with priors that are weak beside the data at a point.
+
+    Unchanged without priors, and where no motion can be integrated.
+    """
     if not smooth_parts(residuals.parameters):
         return residuals
     with contextlib.suppress(LostMotion):
@@ -66,7 +68,7 @@ def begin_weakly(residuals: Residuals, point: Point, law: AbstractNoise) -> Resi
 
 
 def find_smoothness(done: Descent, law: AbstractNoise, tell: Callable[[str], None] | None) -> Descent:
-    """The fit with the strengths of priors that evidence asks for, from one with any; unchanged without priors."""
+    """The fit with the prior strengths of learned functions that maximise the evidence; unchanged without priors."""
     if not smooth_parts(done.residuals.parameters):
         return done
     trials, text, last, pace = done.trials, "The smoothness did not settle.", {}, 1.0

@@ -221,7 +221,9 @@ def _disagreements(
     def clause(k: int) -> tuple[str, str]:
         sizes = shifts.sizes[k]
         place = int(np.argmax(np.abs(sizes)))
-        return residuals.label(shifts.records[k]), _shift_clause(labels[place], sizes[place])
+        way = "up" if sizes[place] > 0 else "down"  # parameters move up with their unknowns
+        by = f"{abs(sizes[place]):.1f} of the standard deviations that chance gives it"
+        return residuals.label(shifts.records[k]), f"{labels[place]} would move {way} by {by}"
 
     return (
         [f"{name} {how}: without it {moves}." for name, moves in map(clause, apart)],
@@ -232,11 +234,6 @@ def _disagreements(
             for k, (name, moves) in zip(pulls, map(clause, pulls), strict=True)
         ],
     )
-
-
-def _shift_clause(label: str, shift: float) -> str:
-    way = "up" if shift > 0 else "down"  # parameters move up with their unknowns
-    return f"{label} would move {way} by {abs(shift):.1f} of the standard deviations that chance gives it"
 
 
 class Shifts(NamedTuple):

@@ -36,7 +36,9 @@ class Edition:
 
     __slots__ = ("__weakref__", "_hash", "_held", "_watch", "function", "helped", "text", "tracers")
 
-    def __init__(self, function: Callable, text: str, held=(), tracers=(), helped=False, watch: "_Watch | None" = None):
+    def __init__(
+        self, function: Callable, text: str, held=(), tracers=(), helped=False, watch: "_EditionWatch | None" = None
+    ):
         self.function, self._watch = function, watch
         self.text, self._held, self.tracers = text, tuple(held), tuple(tracers)
         self.helped = helped  # by other functions, whose traces JAX may keep
@@ -45,7 +47,7 @@ class Edition:
     @classmethod
     def from_function(cls, function: Callable) -> "Edition":
         is_plain = isinstance(function, types.FunctionType)
-        return (_watch_of(function) if is_plain else _Watch(function)).edition()
+        return (_watch_of(function) if is_plain else _EditionWatch(function)).edition()
 
     def trace_edition(self, function: Callable, how: str) -> "Edition":
         """Return the edition of a jaxpr of this function whose tracers became arguments; `how` is part of its key."""
@@ -129,7 +131,7 @@ _own: dict[tuple[int, str | None], Any] = {}
 _MOST_OWN = 1000
 
 
-class _Watch:
+class _EditionWatch:
     """A function, its latest edition, and the places where all values that it read were found."""
 
     def __init__(self, function: Callable):
@@ -178,7 +180,7 @@ def _changed_places(before: Marks, now: "_LiveWalk") -> dict[tuple[int, str | No
 
 
 # Holds the functions and what they close over; a signature and a walk take as long as a short motion.
-_watch_of = functools.lru_cache(maxsize=64)(_Watch)
+_watch_of = functools.lru_cache(maxsize=64)(_EditionWatch)
 
 
 class _LiveWalk(Walk):

@@ -137,10 +137,6 @@ def _arithmetic_operators(op: str) -> "tuple[Callable[[Value, Any], Value], Call
     return lambda x, y: x.code.arithmetic(op, x, y), lambda x, y: x.code.arithmetic(op, y, x)
 
 
-def _comparison_operator(op: str) -> "Callable[[Value, Any], Value]":
-    return lambda x, y: x.code.compare(op, x, y)
-
-
 class Instruction(str):
     """The text of one of the instructions that most of a kernel is, and the name of its result.
 
@@ -166,7 +162,7 @@ class Value:
     __sub__, __rsub__ = _arithmetic_operators("sub")
     __mul__, __rmul__ = _arithmetic_operators("mul")
     __truediv__, __rtruediv__ = _arithmetic_operators("div")
-    __lt__, __le__, __gt__, __ge__ = map(_comparison_operator, ("<", "<=", ">", ">="))
+    __lt__, __le__, __gt__, __ge__ = (lambda x, y, op=op: x.code.compare(op, x, y) for op in ("<", "<=", ">", ">="))
 
     def __abs__(self):
         return self.code.intrinsic("fabs", self)

@@ -94,7 +94,7 @@ class Loop:
         return self.function(*arguments)
 
     def bind(self, **names) -> "Loop":
-        """The same loop with new values for some global names that it reads."""
+        """A copy of the loop with new values for some global names that it reads."""
         code, known = self.function.__code__, {**self.names, **names}
         return Loop(types.FunctionType(code, known, self.name, self.function.__defaults__))
 

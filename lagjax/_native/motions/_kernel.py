@@ -72,7 +72,7 @@ class Steps(NamedTuple):
         return self._replace(first=self.first[places], counts=self.counts[places], rows=self.rows[places])
 
     def split_members(self) -> Iterator[tuple[int, np.ndarray]]:
-        """Pairs of each member's row and its part of the `table` of steps."""
+        """Pairs (k, table) of the index of a member and the rows of `table` that are its steps."""
         for row, first, count in zip(self.rows.tolist(), self.first, self.counts, strict=True):
             yield row, self.table[first : first + count]
 

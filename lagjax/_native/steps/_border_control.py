@@ -24,9 +24,9 @@ from lagjax._native.steps._saltation import Saltation
 from lagjax._native.steps._step import absolute_tolerance
 from lagjax._native.steps._watch import (
     Border,
-    BorderKind,
-    ContactKind,
+    Contact,
     GuardTable,
+    StepEnd,
     joint_groups,
     reaches_border,
     step_to_border,
@@ -65,7 +65,7 @@ class BorderControl:
     def fields(borders: Borders) -> Fields:
         guards, pieces = len(borders.guards), len(borders.decisions)
         fields: Fields = {
-            "touch": guards,  # the `ContactKind` of a guard where the step begins
+            "touch": guards,  # the `Contact` of a guard where the step begins
             "stays": pieces,  # 1 for a piece that is not decided anew
             "at_knots": 1,  # the number of steps that ended at entries of tables
             "beyond": 1,  # the piece beyond the guard that the step ends at
@@ -102,7 +102,7 @@ class BorderControl:
             lane[name] = 0.0
         lane["undecided"] = 1.0
         with frame.code.loop(len(self.borders.guards)) as g:
-            lane["touch", g] = ContactKind.NONE
+            lane["touch", g] = Contact.NONE
         with frame.code.loop(self.pieces) as j:
             lane["stays", j], lane["params", j + self.motion.parameters] = 0.0, 0.0
 
@@ -112,14 +112,14 @@ class BorderControl:
         code, (order,), h = frame.code, frame.arguments, frame["h"]
         degree = self.motion.followed_degree(code, order)
         frame["planned"], frame["nearest"] = h, 1.0
-        frame["crossed"], frame["crossed_number"], frame["beyond"] = BorderKind.NOTHING, 0.0, 0.0
+        frame["crossed"], frame["crossed_number"], frame["beyond"] = StepEnd.NOTHING, 0.0, 0.0
         if self.pieces:
             self.knots.end_step_at_knot(frame, h)
             self._record_levels(frame)
             if self.slides:
                 frame["slides"] = 0.0
                 for border in self.table.each(frame):
-                    frame.assign(border.touch >= ContactKind.SLIDING, slides=1)
+                    frame.assign(border.touch >= Contact.SLIDING, slides=1)
             for border in self.table.each(frame):
                 self._record_crossing(frame, border, degree, h)
             if self.table.groups:
@@ -139,7 +139,7 @@ class BorderControl:
         side, level, beyond = border.rule("side")(piece), border.level(piece), border.rule("beyond")(piece)
         is_share, undecided = border.has("on"), code.compare("==", side, 0.0)
         # Nothing is looked for along the border that the motion slides on, or in the share of one that does not.
-        idle = (border.touch >= ContactKind.SLIDING) | (undecided & is_share)
+        idle = (border.touch >= Contact.SLIDING) | (undecided & is_share)
         if self.table.groups:
             frame["joins", border.g] = 2.0
         with code.only_if(code.any_lane(~idle)):
@@ -147,7 +147,7 @@ class BorderControl:
             at_limit = (abs(frame["poly", 0]) <= limits.JUMP_NOISE) & (frame["steps"] > 0.0)
             if self.borders.releases:
                 self._limit_growth(frame, border, level)
-            comes = ~undecided & (~is_share | at_limit) & (border.touch <= ContactKind.NONE)
+            comes = ~undecided & (~is_share | at_limit) & (border.touch <= Contact.NONE)
             leads = self.roots.leading_sign(frame, degree)
             self.roots.divide(frame, degree, border.touch)
             idle = idle | (self._is_rounding(frame, border, degree) & ~undecided)
@@ -165,7 +165,7 @@ class BorderControl:
         length, rate = frame["poly", 0] + level, frame["poly", 1]
         part = limits.GROWTH_OF_LENGTH * length / rate
         sooner = border.is_cone & ~border.has("on") & (rate > 0.0) & (length > level) & (part < frame["nearest"])
-        frame.assign(sooner, nearest=part, crossed=BorderKind.NOTHING)
+        frame.assign(sooner, nearest=part, crossed=StepEnd.NOTHING)
 
     def _is_rounding(self, frame: Frame, border: Border, degree: Value) -> Value:
         """True if a guard, with polynomial `poly`, leaves a border that the motion touches by rounding alone.
@@ -179,7 +179,7 @@ class BorderControl:
         patience = (turns * turns) * (turns * turns) * turns
         atol = code.lanes_of(absolute_tolerance(frame))
         nothing = self.roots.coefficient_sum(frame, degree) <= limits.NEGLIGIBLE * atol * patience
-        touches = border.touch > ContactKind.NONE
+        touches = border.touch > Contact.NONE
         if self.slides:  # along u = 0 another border of |u| is there by rounding
             touches = touches | (frame["slides"] > 0.0)
         first = [abs(frame["poly", k]) for k in range(3)]  # the last ones may have become zero
@@ -195,7 +195,7 @@ class BorderControl:
         code, (undecided, beyond, leads) = frame.code, piece
         # At rest but for what it gains in so little time: u̇ is of the size of ü t.
         gain = 4.0 * (abs(frame["poly", 2]) * frame["root"])
-        at_rest = (border.touch > ContactKind.NONE) | (abs(frame["poly", 1]) <= gain)
+        at_rest = (border.touch > Contact.NONE) | (abs(frame["poly", 1]) <= gain)
         # A number that is zero leaves zero as its first coefficient says, or stays.
         leaves = undecided & code.compare("!=", leads, 0.0)
         root = code.select(undecided, code.select(leaves, 0.0, 2.0), self.roots.step_fraction(frame, 2.0))
@@ -207,7 +207,7 @@ class BorderControl:
         sooner = (root < frame["nearest"] * apart) & code.compare("!=", h, 0.0) & ~idle
         if self.table.groups:
             frame.assign(is_root & ~undecided & ~idle, border.g, joins=root)
-        crossed = code.select(is_root, BorderKind.GUARD, BorderKind.NOTHING)
+        crossed = code.select(is_root, StepEnd.GUARD, StepEnd.NOTHING)
         frame.assign(sooner, nearest=root, at_rest=at_rest, crossed=crossed, crossed_number=code.as_double(border.g))
         frame.assign(sooner, beyond=code.select(undecided, leads, beyond))
 
@@ -230,7 +230,7 @@ class BorderControl:
         for border in self.table.each(frame):
             group = groups.read(code, border.g, "group")
             with code.only_if(group >= 0):
-                is_first = may_join & self.table.crosses(frame, BorderKind.GUARD, border.g)
+                is_first = may_join & self.table.crosses(frame, StepEnd.GUARD, border.g)
                 frame.assign(is_first, group, taken=1)
                 joins.value = code.select(is_first, 1.0, joins.value)
         for border in self.table.each(frame):
@@ -280,11 +280,11 @@ class BorderControl:
     def drop_missed_border(self, frame: Frame) -> None:
         """Drop the border of a step that was shortened and does not reach it."""
         code = frame.code
-        frame["crossed"] = code.select(reaches_border(frame), frame["crossed"], BorderKind.NOTHING)
+        frame["crossed"] = code.select(reaches_border(frame), frame["crossed"], StepEnd.NOTHING)
         frame["stepped"] = stepped = code.compare("!=", frame["h"], 0.0)
         if self.kicks is not None:
             stepped = self.kicks.mark_recorded_steps(frame, stepped)
-        at_knot = (frame["stepped"] > 0.0) & (frame["crossed"] > BorderKind.GUARD)
+        at_knot = (frame["stepped"] > 0.0) & (frame["crossed"] > StepEnd.GUARD)
         frame["at_knots"] = frame["at_knots"] + code.flag(at_knot)
         frame.assign(stepped, is_hit=0.0, grazes=0.0, stops=0.0)
         frame.call(self.graze)
@@ -299,7 +299,7 @@ class BorderControl:
         code, order, by = frame.code, frame.job("order"), [*range(base), *range(n, n + base)]
         line = gradient(self.borders, by)
         counts = self.table.counts(frame)
-        noted, ends = self.table.crosses_any(frame) & counts, self.table.crosses(frame, BorderKind.GUARD) & counts
+        noted, ends = self.table.crosses_any(frame) & counts, self.table.crosses(frame, StepEnd.GUARD) & counts
         with code.only_if(code.any_lane(noted)):
             self.table.record_hit(frame, noted)
         with code.only_if(code.any_lane(ends)):

@@ -12,7 +12,7 @@ from lagjax._native.steps._knots import Knots
 from lagjax._native.steps._retraction import Retraction
 from lagjax._native.steps._saltation import Saltation
 from lagjax._native.steps._step import absolute_tolerance
-from lagjax._native.steps._watch import Border, BorderKind, ContactKind, reaches_border, step_to_border
+from lagjax._native.steps._watch import Border, Contact, StepEnd, reaches_border, step_to_border
 from lagjax._program import SLIDE, Borders, Jump, Nesting, eliminate_dead_code
 
 _NOT_HOLDING = 1e6  # a share of a border that both sides do not push onto: those of others are near 0 … 1
@@ -58,7 +58,7 @@ class BorderCrossing:
             for border in self.table.each(frame):
                 slide = border["slide"]
                 with code.only_if((slide >= 0) & code.compare("==", border.g, border["rest"])):
-                    border.remember(undecided & (self.table.piece(frame, slide) > 0.0), touch=ContactKind.SLIDING)
+                    border.remember(undecided & (self.table.piece(frame, slide) > 0.0), touch=Contact.SLIDING)
             frame["undecided"] = 0.0
         return frame.finish()
 
@@ -70,16 +70,12 @@ class BorderCrossing:
         """Emit `()`: after the step, set the pieces beyond the borders that it reached."""
         frame = self.motion.function("cross")
         code = frame.code
-        stepped, crosses, was_cut = (
-            frame["stepped"] > 0.0,
-            frame["crossed"] > BorderKind.NOTHING,
-            frame["nearest"] < 1.0,
-        )
+        stepped, crosses, was_cut = (frame["stepped"] > 0.0, frame["crossed"] > StepEnd.NOTHING, frame["nearest"] < 1.0)
         if self.retraction is not None:  # borders that are left before the step begins do not take the state
             has_begun = stepped | (frame["returned"] > 0.0) if self.forgotten else stepped
             self.retraction.undo(frame, ~has_begun)
         for border in self.table.each(frame):
-            border.remember(stepped & (border.touch < ContactKind.SLIDING), touch=ContactKind.NONE)
+            border.remember(stepped & (border.touch < Contact.SLIDING), touch=Contact.NONE)
         with code.only_if(code.any_lane(crosses | was_cut)):
             # What a cut step was to be says more about the next one than what it became.
             longest = limits.GROWTH * abs(frame["planned"])
@@ -92,7 +88,7 @@ class BorderCrossing:
                 self.kicks.record_pieces(frame)
             self._pass_borders(frame, crosses)
             if self.table.groups:
-                counts = stepped & self.table.crosses(frame, BorderKind.GUARD)
+                counts = stepped & self.table.crosses(frame, StepEnd.GUARD)
                 frame["steps"] = frame["steps"] + code.select(counts, frame["more"], 0.0)
             frame.assign(crosses, **self.forgotten)
             if self.kicks is not None:
@@ -128,7 +124,7 @@ class BorderCrossing:
         """Record that the motion neither touches the borders of some pieces nor slides along them."""
         for g, guard in enumerate(self.borders.guards):
             if guard.piece in pieces:
-                frame.assign(where, g, touch=ContactKind.NONE)
+                frame.assign(where, g, touch=Contact.NONE)
                 if guard.slide >= 0:
                     frame.assign(where, self.motion.parameters + guard.slide, params=0.0)
 
@@ -141,7 +137,7 @@ class BorderCrossing:
         for j in self.borders.clocks:
             frame["stays", j] = 1.0
         for border in self.table.each(frame):
-            frame.assign(frame.code.compare("!=", border.touch, float(ContactKind.NONE)), border["piece"], stays=1)
+            frame.assign(frame.code.compare("!=", border.touch, float(Contact.NONE)), border["piece"], stays=1)
         self._redecide_piece(frame, going)
 
     def _enter_beyond(self, frame: Frame, border: Border) -> None:
@@ -153,28 +149,24 @@ class BorderCrossing:
         """
         code, hit, again, beyond = frame.code, border.is_hit, frame["stepped"] <= 0.0, frame["beyond"]
         if self.table.groups:
-            is_first = self.table.crosses(frame, BorderKind.GUARD, border.g)
+            is_first = self.table.crosses(frame, StepEnd.GUARD, border.g)
             beyond = code.select(is_first, beyond, border.rule("beyond")(border.piece))
         no_time = ~again & (abs(step_to_border(frame)) <= limits.NO_TIME * frame["smallest"])
         no_time = (no_time | (~again & (frame["stops"] > 0.0))) & (frame["at_rest"] > 0.0)
         place, back, slide = border["piece"] + self.motion.parameters, border["back"], border["slide"]
         bounces = no_time & border.has("order", 2)  # by position
-        slides = bounces | (again & (border.touch > ContactKind.NONE))
+        slides = bounces | (again & (border.touch > Contact.NONE))
         if self.borders.releases:
             slides = slides | border.is_cone
         slides = hit & slides & border.has("slide")
         frame.assign(hit & ~slides, place, params=beyond)
         # A share jumps to where it is: it need not touch the border that it had crossed before.
-        frame.assign(hit, back, touch=code.select(border.has("on"), ContactKind.NONE, ContactKind.VALUE))
+        frame.assign(hit, back, touch=code.select(border.has("on"), Contact.NONE, Contact.VALUE))
         with code.only_if(slide >= 0):
             below = code.select(border.piece < beyond, border.piece, beyond)
             frame.assign(slides, place, params=code.select(border.is_sign, -1.0, below))
             frame.assign(slides, slide + self.motion.parameters, params=1)
-            for g, touch in (
-                (border.g, ContactKind.NONE),
-                (back, ContactKind.NONE),
-                (border["rest"], ContactKind.SLIDING),
-            ):
+            for g, touch in ((border.g, Contact.NONE), (back, Contact.NONE), (border["rest"], Contact.SLIDING)):
                 frame.assign(slides, g, touch=touch)
         self._leave_sliding(frame, border, hit, again)
 
@@ -194,17 +186,17 @@ class BorderCrossing:
             as_written = code.select(on.is_sign, 0.0, below + code.select(toward_zero, 0.0, 1.0))
             place = on["piece"] + self.motion.parameters
             frame.assign(hit, place, params=code.select(unheld, as_written, below + gains))
-            frame.assign(hit, border["rest"], touch=ContactKind.NONE)
-            on.remember(hit, touch=code.select(again, order, order + ContactKind.VALUE))
-            on.remember(unheld, touch=ContactKind.CONTINUES)
+            frame.assign(hit, border["rest"], touch=Contact.NONE)
+            on.remember(hit, touch=code.select(again, order, order + Contact.VALUE))
+            on.remember(unheld, touch=Contact.CONTINUES)
             if self.borders.releases:  # the vector of a cone has been given a length beyond its level
-                on.remember(hit & on.is_cone, touch=ContactKind.NONE)
+                on.remember(hit & on.is_cone, touch=Contact.NONE)
 
     def _release_cones(self, frame: Frame) -> None:
         """Give the vectors of released cones a speed in the direction of the force, twice that which counts as rest."""
         code, motion, n = frame.code, self.motion, len(self.borders.holding.release.outputs)
         shares = self.borders.releases
-        hits = [self.table.crosses(frame, BorderKind.GUARD, g) for g in shares]
+        hits = [self.table.crosses(frame, StepEnd.GUARD, g) for g in shares]
         base = n // (2 * len(shares))
         with code.only_if(code.any_lane(functools.reduce(Value.__or__, hits))):
             out = motion.evaluate_now(frame, self.borders.holding.release)

@@ -5,7 +5,7 @@ from lagjax._native.code._frame import Fields, Frame
 from lagjax._native.code._ir import Code, Value
 from lagjax._native.series._taylor import TaylorSeries, integer
 from lagjax._native.steps._roots import Roots
-from lagjax._native.steps._watch import Border, BorderKind, ContactKind, GuardTable
+from lagjax._native.steps._watch import Border, Contact, GuardTable, StepEnd
 from lagjax._program import SIGN, Borders
 
 _AT_END = 16.0  # roundings of the time by which the end of a motion may miss an instant and is still taken to be there
@@ -44,7 +44,7 @@ class Kicks:
         found = frame.constant(0.0) > 0.0
         for g, guard in enumerate(self.borders.guards):
             if self._kicks_by_sign(guard.piece):
-                found = found | self.table.crosses(frame, BorderKind.GUARD, g)
+                found = found | self.table.crosses(frame, StepEnd.GUARD, g)
         return begins & found & frame.code.compare("==", frame["h"], 0.0)
 
     def _kicks_by_sign(self, j: int) -> bool:
@@ -64,7 +64,7 @@ class Kicks:
             noise = _AT_END * limits.EPS * abs(frame["t_end"] / h * slope)
             there = ends & code.compare("!=", side, 0.0) & (end <= noise) & code.compare("==", frame["nearest"], one)
             beyond = guard.beyond(border.piece)
-            frame.assign(there, crossed=BorderKind.GUARD, crossed_number=float(g), beyond=beyond)
+            frame.assign(there, crossed=StepEnd.GUARD, crossed_number=float(g), beyond=beyond)
 
     def _kick_velocities(self, base: int) -> Code:
         """Emit `()`: set the velocities behind the border in lanes with `kicks` = 1; 2 marks a reflection."""
@@ -108,7 +108,7 @@ class Kicks:
             with code.loop(self.motion.pieces) as j:
                 frame.assign(reflected, j + self.motion.parameters, params=frame["kick_before", j])
             for border in self.table.each(frame):
-                border.remember(reflected, touch=code.select(border.is_hit, ContactKind.VALUE, ContactKind.NONE))
+                border.remember(reflected, touch=code.select(border.is_hit, Contact.VALUE, Contact.NONE))
             frame["kicks"] = code.select(reflected, 1.0, 0.0)
             frame.call(self.kick)
         return kicks > 0.0

@@ -19,7 +19,7 @@ from lagjax._native.series._taylor import TaylorSeries, double
 from lagjax._native.steps._roots import Roots
 from lagjax._native.steps._run_records import OutputWriter
 from lagjax._native.steps._step import StepControl
-from lagjax._native.steps._watch import END_OF_STEP, Columns, ContactKind, Watch, reaches_border
+from lagjax._native.steps._watch import END_OF_STEP, Columns, Contact, Watch, reaches_border
 from lagjax._program import inputs_below
 
 
@@ -60,7 +60,7 @@ class Events:
             "measured": (guards, 5),  # where a motion begins, the outputs of the program of `Guards`
             "zero": guards,  # the value that counts as zero
             "side": guards,  # its sign where the step begins
-            "contact": guards,  # a `ContactKind` there
+            "contact": guards,  # a `Contact` there
             "noted": guards,  # how often it has been noted before
             **{f"{name}_end": guards for name in MEMORY},  # these three where the step ends
             "met": guards,  # the `SignChange` at the start; 0 without any
@@ -149,8 +149,8 @@ class Events:
             met = met | (fresh & ~on_it & (value * direction * watch.number("holds") > 0.0))
         frame["met", g] = code.select(met, code.select(before > 0.0, SignChange.FALLS, SignChange.RISES), 0.0)
         side = code.select(on_it, code.select(met | code.compare("==", going, 0.0), before, going), value)
-        zeros = code.select(leaves, ContactKind.VALUE, code.select(sound, order_of_zero, ContactKind.RATE))
-        watch.remember(fresh, side=self._sign_of(frame, side), contact=code.select(on_it, zeros, ContactKind.NONE))
+        zeros = code.select(leaves, Contact.VALUE, code.select(sound, order_of_zero, Contact.RATE))
+        watch.remember(fresh, side=self._sign_of(frame, side), contact=code.select(on_it, zeros, Contact.NONE))
         if is_rounded:
             watch.remember(fresh, zero=code.select(on_it, value, 0.0))
 
@@ -238,7 +238,7 @@ class Events:
         frame["change", g], frame["root_at", g] = met, code.select(happened, 0.0, float("inf"))
         frame.assign(happened, first_at=0.0)
         frame["side_end", g], frame["noted_end", g] = side, frame["noted", g]
-        frame["contact_end", g] = code.select(moving, ContactKind.NONE, frame["contact", g])
+        frame["contact_end", g] = code.select(moving, Contact.NONE, frame["contact", g])
         degree, j, zero = self.motion.followed_degree(code, order), g + self.first, frame["zero", g]
         here = self._sign_of(frame, self.motion.followed_value(frame, j) - zero)
         side = code.select(code.compare("==", side, 0.0), here, side)
@@ -277,13 +277,13 @@ class Events:
         roots.shorten(frame, degree, is_long)
         frame["doubt"], frame["begin"], frame["closer"] = roots.last_terms(frame, degree), 0.0, 1.0
         # A motion that begins on the surface, or has just gone through it, is not to do so by rounding.
-        continues = (contact < ContactKind.NONE) & (abs(start) <= limits.CONTINUOUS * size)
-        powers = code.select(continues, float(ContactKind.VALUE), contact)
+        continues = (contact < Contact.NONE) & (abs(start) <= limits.CONTINUOUS * size)
+        powers = code.select(continues, float(Contact.VALUE), contact)
         roots.divide(frame, degree, powers)
         roots.store_bounds(frame, degree)
         frame["instant"] = 0.25 * frame["smallest"] / (abs(h) * frame["part"])  # no time is known better than this
         rounding = (limits.ROOT_NOISE * limits.EPS) * watch.recall("kept")
-        matters = (rounding < float("inf")) & ~(powers > ContactKind.NONE)
+        matters = (rounding < float("inf")) & ~(powers > Contact.NONE)
         frame["unsure"] = abs(frame["poly", 1]) * frame["instant"] + code.select(matters, rounding, 0.0)
         ahead = code.variable(side)
         self._follow_roots(watch, order, degree, ahead, moving & sound)
@@ -312,7 +312,7 @@ class Events:
             is_root = searching() & self.roots.is_found(frame)
             self._limit_accurate_part(frame, searching() & ~is_root, self.roots.step_fraction(frame, 1.0))
             waits = is_root & self._ends_at_border(watch)
-            watch.remember(waits, contact_end=ContactKind.CONTINUES)
+            watch.remember(waits, contact_end=Contact.CONTINUES)
             changes = is_root & ~waits
             with code.only_if(code.any_lane(changes)):
                 s = self._refine_root(watch, order, changes, ahead.value)
@@ -381,7 +381,7 @@ class Events:
             goes_on = changes & ~counts
         ahead.value = code.select(goes_on, 0.0 - side, side)
         left = abs(frame["h"]) - size
-        watch.remember(goes_on & (left <= limits.INSTANT * frame["smallest"]), contact_end=ContactKind.CONTINUES)
+        watch.remember(goes_on & (left <= limits.INSTANT * frame["smallest"]), contact_end=Contact.CONTINUES)
         return goes_on
 
     def _bisect_change(self, watch: Watch, order: Value, ahead: Variable, where: Value) -> None:

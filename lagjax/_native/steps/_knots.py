@@ -4,7 +4,7 @@ from lagjax._native.code import _constants as limits
 from lagjax._native.code._frame import Frame
 from lagjax._native.code._ir import Value
 from lagjax._native.series._taylor import TaylorSeries
-from lagjax._native.steps._watch import BorderKind, GuardTable
+from lagjax._native.steps._watch import GuardTable, StepEnd
 from lagjax._program import Borders
 
 
@@ -57,7 +57,7 @@ class Knots:
             is_inner = self.table.piece(frame, j) < float(located.table.count - 1 - located.closed)
             at_end = (frame["forward"] > 0.0) & is_inner & code.compare("==", left, nearest) & (size > 0.0)
             sooner = sooner | (inside & at_end & code.compare("==", frame["crossed"], 0.0))
-        frame.assign(sooner, nearest=left / size, crossed=BorderKind.KNOT, crossed_number=float(c))
+        frame.assign(sooner, nearest=left / size, crossed=StepEnd.KNOT, crossed_number=float(c))
 
     def _record_coincidence(self, frame: Frame, h: Value) -> None:
         """Mark knots of several tables at one instant, if one of them can depend on parameters."""
@@ -69,7 +69,7 @@ class Knots:
             count = count + code.flag(at_once)
             if j in self.table.movable:
                 moves = moves + code.flag(at_once)
-        frame.assign((count > 1.0) & (moves > 0.0), crossed=BorderKind.KNOTS)
+        frame.assign((count > 1.0) & (moves > 0.0), crossed=StepEnd.KNOTS)
 
     def _instant_tolerance(self, frame: Frame) -> Value:
         """The largest difference of two times that count as equal."""

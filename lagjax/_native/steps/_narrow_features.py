@@ -8,7 +8,7 @@ from lagjax._native.code._frame import Frame
 from lagjax._native.code._ir import Value
 from lagjax._native.series._taylor import TaylorSeries, integer
 from lagjax._native.steps._roots import Roots
-from lagjax._native.steps._watch import BorderKind
+from lagjax._native.steps._watch import StepEnd
 from lagjax._program import BELOW, BESIDE, FALLS, GROWS, UP_TO, Feature
 
 
@@ -79,7 +79,7 @@ class NarrowFeatures:
         if kind in (UP_TO, FALLS):
             matters, root = self._approach(frame, kind, h, matters, root)
         sooner = matters & (root > 0.0) & (root < frame["nearest"]) & code.compare("!=", h, 0.0)
-        frame.assign(sooner, nearest=root, crossed=BorderKind.NOTHING)
+        frame.assign(sooner, nearest=root, crossed=StepEnd.NOTHING)
 
     def _approach_level(self, frame: Frame, j: Value, feature: Feature, degree: Value, h: Value) -> tuple:
         """The level α + β u of a feature, whose zero is as near as a step may come.

@@ -14,7 +14,7 @@ from lagjax._native.code._ir import Code, Value
 from lagjax._native.series._cotangents import Cotangents, add
 from lagjax._native.series._tangent_memory import Directions
 from lagjax._native.series._taylor import TaylorSeries
-from lagjax._native.steps._watch import BorderKind, GuardTable, HitKind
+from lagjax._native.steps._watch import GuardTable, HitKind, StepEnd
 from lagjax._program import Borders, Jump, Table
 
 
@@ -31,7 +31,7 @@ class Saltation:
     def fields(borders: Borders) -> Fields:
         pieces = len(borders.switches)
         return {
-            "crossed": 1,  # the `BorderKind` that the step ends at
+            "crossed": 1,  # the `StepEnd` that the step ends at
             "crossed_number": 1,  # the number of that guard, or clock
             "pieces_before": pieces,  # the pieces before the border
             "hit": pieces,  # not 0 for the piece whose switching number is zero at the border
@@ -193,7 +193,7 @@ class Saltation:
         """Emit `()`: cotangents of the state before a border, and of parameters, from those of the state beyond."""
         motion, frame = self.motion, self.motion.function("back_border")
         code = frame.code
-        frame["crossed"] = code.select(frame["has_after"] > 0.0, frame["crossed"], BorderKind.NOTHING)
+        frame["crossed"] = code.select(frame["has_after"] > 0.0, frame["crossed"], StepEnd.NOTHING)
         with code.only_if(code.any_lane(self.table.crosses_any(frame))):
             self._record_edge(frame)
             gain, tables, entries = self._cotangent_jumps(frame, frame.vectors("pieces_after", motion.pieces))

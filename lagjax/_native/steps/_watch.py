@@ -1,7 +1,7 @@
 """Watches: numbers that are compared with a level along a step, and what is remembered of each.
 
 A watch finds the instant at which its number reaches the level from its side. If a motion starts on the level, or moves
-along it, a `ContactKind` records that: rounding must not decide on which side the next step begins. At the instant the
+along it, a `Contact` records that: rounding must not decide on which side the next step begins. At the instant the
 motion enters the next piece (`Border`, `_border_control`), or it stops, or it is recorded and continues (`_events`).
 """
 
@@ -40,7 +40,7 @@ def reaches_border(frame: Frame) -> Value:
     return frame.code.compare("==", frame["h"], step_to_border(frame))
 
 
-class ContactKind(IntEnum):
+class Contact(IntEnum):
     """The contact of a number with its level at the start of a step: none, of its value, of rates too, permanent.
 
     Values between count the rates that are zero, and one for the value. A root at the start is not searched for, and
@@ -56,7 +56,7 @@ class ContactKind(IntEnum):
     SLIDING = 4
 
 
-class BorderKind(IntEnum):
+class StepEnd(IntEnum):
     """The border at the end of a step: none, a guard, a knot of a clock, or knots of several at one instant."""
 
     NOTHING = 0
@@ -142,10 +142,10 @@ class Border(Watch):
     @property
     def is_hit(self) -> Value:
         """True in the lanes whose step ends at this border."""
-        is_first = self.table.crosses(self.frame, BorderKind.GUARD, self.g)
+        is_first = self.table.crosses(self.frame, StepEnd.GUARD, self.g)
         if not self.table.groups:
             return is_first
-        return is_first | (self.table.crosses(self.frame, BorderKind.GUARD) & (self.recall("joins") > 0.0))
+        return is_first | (self.table.crosses(self.frame, StepEnd.GUARD) & (self.recall("joins") > 0.0))
 
     @property
     def is_sign(self) -> Value:
@@ -204,7 +204,7 @@ class GuardTable(Columns):
     def piece(self, frame: Frame, j: Index) -> Value:
         return frame["params", j + self.motion.parameters]
 
-    def crosses(self, frame: Frame, kind: BorderKind, number: Index | None = None) -> Value:
+    def crosses(self, frame: Frame, kind: StepEnd, number: Index | None = None) -> Value:
         """True if a step ends at a border of this kind: any one, or the one with this number."""
         code, crosses = frame.code, frame.code.compare("==", frame["crossed"], float(kind))
         if number is None:
@@ -214,8 +214,8 @@ class GuardTable(Columns):
 
     def crosses_any(self, frame: Frame) -> Value:
         """True if a step ends at a guard, or at knots that are parameters."""
-        kinds = (BorderKind.GUARD, *((BorderKind.KNOTS,) if self.knots else ()))
-        at_knots = [self.crosses(frame, BorderKind.KNOT, c) for c, _ in self.knots]
+        kinds = (StepEnd.GUARD, *((StepEnd.KNOTS,) if self.knots else ()))
+        at_knots = [self.crosses(frame, StepEnd.KNOT, c) for c, _ in self.knots]
         return functools.reduce(Value.__or__, at_knots + [self.crosses(frame, kind) for kind in kinds])
 
     def counts(self, frame: Frame) -> Value:
@@ -225,9 +225,9 @@ class GuardTable(Columns):
     def kicks(self, frame: Frame) -> Value:
         """True if a step ends at a border at which L jumps."""
         kicking, crosses = self.borders.kicking, functools.partial(self.crosses, frame)
-        ends = [crosses(BorderKind.GUARD, g) for g, guard in enumerate(self.borders.guards) if guard.piece in kicking]
-        ends += [crosses(BorderKind.KNOT, c) for c, j in enumerate(self.borders.clocks) if j in kicking]
-        return functools.reduce(Value.__or__, [*ends, *([crosses(BorderKind.KNOTS)] if self.movable else [])])
+        ends = [crosses(StepEnd.GUARD, g) for g, guard in enumerate(self.borders.guards) if guard.piece in kicking]
+        ends += [crosses(StepEnd.KNOT, c) for c, j in enumerate(self.borders.clocks) if j in kicking]
+        return functools.reduce(Value.__or__, [*ends, *([crosses(StepEnd.KNOTS)] if self.movable else [])])
 
     # ---- what a step ends at ----
 
@@ -248,13 +248,13 @@ class GuardTable(Columns):
             decided = code.compare("!=", border.rule("side")(frame["pieces_before", j]), 0.0)
             if self.borders.kicking:  # where L jumps, a motion that begins on the border comes from what L is there
                 decided = decided | self.kicks(frame)
-            with frame.where(where & self.crosses(frame, BorderKind.GUARD, border.g) & decided):
+            with frame.where(where & self.crosses(frame, StepEnd.GUARD, border.g) & decided):
                 frame["hit", j], frame["is_hit"] = 1, HitKind.BORDER
                 if moves:
                     frame["entry", j] = border.piece + border.rule("level").offset
         for k, (c, j) in enumerate(self.knots):
-            several = where & self.crosses(frame, BorderKind.KNOTS)
-            with frame.where(several | (where & self.crosses(frame, BorderKind.KNOT, c))):
+            several = where & self.crosses(frame, StepEnd.KNOTS)
+            with frame.where(several | (where & self.crosses(frame, StepEnd.KNOT, c))):
                 # Where several coincide no rational directions of theirs cancel, to a jump of nothing.
                 frame["hit", j], frame["is_hit"] = math.exp(k), code.select(several, HitKind.SEVERAL, HitKind.BORDER)
                 if moves:

@@ -113,7 +113,7 @@ def integrate_concrete(plan: ContactPlan, layout: Layout, params: PyTree, ts, y0
         values = [np.broadcast_to(x, members) for x in scene.coefficients.evaluate_many(list(vectors.T))]
         coefficients = np.split(np.stack(values, axis=-1), [scene.flat.shapes.count], axis=1)
     code, given = scene.replay.code, (np.asarray(ts, float), np.asarray(y0, float), vectors)
-    found = code.run(*given, *coefficients, room=None)
+    found = code.search_batch(*given, *coefficients, room=None)
     return _arrange_outcome(scene, found, *scene.replay.read(found), ())
 
 

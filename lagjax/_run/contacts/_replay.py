@@ -56,7 +56,7 @@ class ContactReplay(Replay):
         n, k = code.sizes["N"], code.sizes["K"]
         self._flow, self._lines = flow, code.lines
         self._find_watches = cast(Callable[[], Surfaces], code.modes[HELD].find_surfaces)
-        # The places at which the parts of what `_end_effects` gives end, but the last.
+        # The places at which the parts of what `_concatenate_effects` gives end, but the last.
         self._ends, self._rough = np.cumsum([1, 1, n, 1, k, 1, 2 * n, 1]), code.arrays["ROUGH"]
         self.said = int(self._ends[5]) - 1
         super().__init__(code, 5)
@@ -72,7 +72,7 @@ class ContactReplay(Replay):
         (t, y), decides, still = start, row.decides > 0, jax.lax.stop_gradient
         numbers = jnp.concatenate([vector, row.did])
         path, *stop = run_stretch(self._flow(), self._find_watches(), self.code.tolerances, times, y, numbers, *event)
-        ended = self._end_effects((*stop, vector, t, y, halves(y0)[1], restitution, friction), record)
+        ended = self._concatenate_effects((*stop, vector, t, y, halves(y0)[1], restitution, friction), record)
         is_behind = np.isin(np.arange(ended.size), np.arange(*self._ends[5:7]))
         smooth = (still(ended[0]) > 0) & (~is_behind | ~decides | (row.leaves_rest == 0))
         ended = differentiable_where(smooth, ended, *stop, vector)
@@ -85,16 +85,17 @@ class ContactReplay(Replay):
         path = jnp.where((ahead & (ts <= row.end))[:, None], path[1:-1], 0.0)
         return jnp.where((decides & (ts > row.end) & (ts <= last))[:, None], behind, path), said, behind, later
 
-    def _end_effects(self, given: tuple, record):
+    def _concatenate_effects(self, given: tuple, record):
+        """The vector of `_evaluate_effects`, by a straight line if that is short."""
         given = (record, *jax.lax.stop_gradient(given[:3]), *given)
-        return self._end_in_parts(*given) if self._watch_line is None else self._watch_line(concatenate(*given))
+        return self._evaluate_effects(*given) if self._watch_line is None else self._watch_line(concatenate(*given))
 
     @functools.cached_property
     def _watch_line(self) -> Line | None:
         n, k, r, numbers = (self.sizes[name] for name in ("N", "K", "R", "NUMBERS"))
-        return self.line_of_end(self._end_in_parts, (), (2 * n,), (numbers,), (), (2 * n,), (n,), (k,), (r,))
+        return self.line_of_end(self._evaluate_effects, (), (2 * n,), (numbers,), (), (2 * n,), (n,), (k,), (r,))
 
-    def _end_in_parts(self, record, *given):
+    def _evaluate_effects(self, record, *given):
         """The effects of the end of a stretch, concatenated into one vector.
 
         A flag that it varies smoothly; time and velocities; for an impact its time, impulses and the energy lost; the

@@ -67,7 +67,7 @@ def integrate_concrete(plan: HybridPlan, layout: Layout, params: PyTree, ts, y0,
     """
     replay, starts = replay_of(plan, layout, params, ts.shape[1]), np.full((len(y0), 1), float(start))
     given = (np.asarray(x, float) for x in (ts, y0, vectors))
-    found = replay.code.run(*given, starts, room=plan.max_transitions + 1)
+    found = replay.code.search_batch(*given, starts, room=plan.max_transitions + 1)
     return _arrange_outcome(plan, layout, replay, found, *replay.read(found), ())
 
 

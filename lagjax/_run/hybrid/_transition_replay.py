@@ -56,7 +56,7 @@ class HybridReplay(Replay):
             of_mode = jnp.where(here, times, t), y, numbers, jnp.where(here, end, t), stop, k, crosses & here
             outputs, *at = run_stretch(parts.make_flow(), parts.surfaces, self.code.tolerances, *of_mode)
             parts_of_end = (*at, numbers, t, y)
-            found = self._end_effects(place, (record, *jax.lax.stop_gradient(parts_of_end[:3]), *parts_of_end))
+            found = self._concatenate_effects(place, (record, *jax.lax.stop_gradient(parts_of_end[:3]), *parts_of_end))
             found = differentiable_where(jax.lax.stop_gradient(found[0]) > 0, found[1:], *at, numbers)
             ended = found if ended is None else jnp.where(here, found, ended)
             path = jnp.where(here & (ahead & (ts <= row.end))[:, None], outputs[1:-1], path)
@@ -64,16 +64,17 @@ class HybridReplay(Replay):
         said, behind = jnp.split(ended, [self.said])
         return path, said, behind, ended[0]
 
-    def _end_effects(self, place: int, given: tuple):
+    def _concatenate_effects(self, place: int, given: tuple):
+        """The vector of `_evaluate_effects`, by a straight line if that is short."""
         line = self._line_of(place)
-        return self._end_in_parts(place, *given) if line is None else line(concatenate(*given))
+        return self._evaluate_effects(place, *given) if line is None else line(concatenate(*given))
 
     def _make_line(self, place: int) -> Line | None:
         states, numbers = 2 * self.sizes["N"], self.sizes["NUMBERS"]
-        function = functools.partial(self._end_in_parts, place)
+        function = functools.partial(self._evaluate_effects, place)
         return self.line_of_end(function, (), (states,), (numbers,), (), (states,))
 
-    def _end_in_parts(self, place: int, record, *given):
+    def _evaluate_effects(self, place: int, record, *given):
         """The effects of the end of a stretch: a flag that it is smooth, time and state there, the state after it."""
         parts, row, still, moving, start = self.parts[place], self._read(record), given[:3], given[3:6], given[6:]
         k, crosses, smooth, (t, y, numbers) = row.watch.astype(int), row.crosses > 0, jnp.array(True), moving

@@ -173,7 +173,7 @@ class SceneCode:
         places = self.law.places
         return Found(*search_p.bind(*given, code=self, names=tuple(places.record if is_replayed else places.said)))
 
-    def run(self, ts, y0, numbers, *given, room: int | None) -> Found:
+    def search_batch(self, ts, y0, numbers, *given, room: int | None) -> Found:
         """As `search`, on NumPy arrays with a member axis first; without `room` records have the longest length."""
         members, scene, states = len(y0), self.scene(len(y0) > 1).copy(), 2 * self.sizes["N"]
         memory, at = np.zeros((members, scene[self.law.places.at.MEMORY])), self.law.places.of
@@ -308,7 +308,7 @@ def _shapes(ts, y0, *_, code: SceneCode, names: tuple[str, ...]):
 def _search_rows(*arrays, code: SceneCode, names: tuple[str, ...]):
     batch = arrays[1].shape[:-1]
     rows = [np.asarray(x, float).reshape(math.prod(batch), x.shape[-1]) for x in arrays]
-    found = code.run(*rows, room=code.sizes["MOST"])
+    found = code.search_batch(*rows, room=code.sizes["MOST"])
     found = found._replace(record=found.record[..., : code.width(names)])
     return [x.reshape(*batch, *x.shape[1:]) for x in found]
 

@@ -147,7 +147,7 @@ def _common_operands(graph: Graph, ids: Ids) -> list[Ids] | None:
 
 
 def _window_place(expansion: Any, indices: Ids, room: list[int], strides: list[int]) -> tuple[Ids, Ids]:
-    """The starts of windows as floats (an index, or an offset in the flattened array), and a mask: they fit."""
+    """The first index of each window (or its offset in the flat array) as a float, and a flag that the window fits."""
     f, number, place, inside = expansion.map, expansion.constants, None, None
     for k, (top, stride) in enumerate(zip(room, strides, strict=True)):
         index = [_as_float(expansion.graph, i) for i in indices[..., k].ravel().tolist()]

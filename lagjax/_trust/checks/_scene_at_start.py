@@ -113,7 +113,7 @@ class CheckedScene(NamedTuple):
         n, m, here = self.layout.size, self.measured, self.point
         moved = direction + direction[-1] * np.concatenate([here[n:-1], np.zeros(n + 1)])
         q, qdot, t, params = self.arguments
-        line = LineValues(*_evaluate_line(self.system, q, qdot, t, params, moved.astype(here.dtype), steps))
+        line = LineValues(*_sum_weighted_outputs(self.system, q, qdot, t, params, moved.astype(here.dtype), steps))
         far, fast = np.abs(here[:n]), np.abs(here[n:-1])
         of_l = far @ np.abs(m.by_q) + fast @ np.abs(m.momentum[0])
         terms = line.terms + np.array([of_l, 0.0, fast @ np.abs(m.by_v_of_dissipation), 0.0, 0.0])
@@ -275,7 +275,8 @@ def _measure_states(here: Sample, offsets: np.ndarray) -> Measured:
 
 
 @eqx.filter_jit
-def _evaluate_line(system: System, q, qdot, t, params, direction, steps):
+def _sum_weighted_outputs(system: System, q, qdot, t, params, direction, steps):
+    """Return the weighted sums `LineValues` at `steps` along a `direction` (2n + 1,), by JAX."""
     layout = Layout.from_state(q, qdot)
     motion, n = derivation_of(system, layout, params).motion, layout.size
     numbers, along = eqx.filter(params, eqx.is_array_like), (direction[:n], direction[n:-1], direction[-1])

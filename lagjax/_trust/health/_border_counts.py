@@ -12,7 +12,7 @@ from lagjax._engine import Problem
 from lagjax._engine.taylor import Flow, Tolerances, flow_of, split_portions
 from lagjax._equations import derivation_of, list_decisions
 from lagjax._interface import Layout
-from lagjax._native import BorderKind
+from lagjax._native import StepEnd
 from lagjax._program import Unlowerable
 from lagjax._run import Members
 from lagjax._scene import System
@@ -81,8 +81,8 @@ def _count_contacts(flow: Flow, ts, y0, params, tolerances: Tolerances, steps, p
             place, (crossed, number), grazes = places[row], table[:, -3:-1].astype(int).T, table[:, -1] > 0
             along = table[:, flow.states + 4 : flow.states + 4 + pieces][:, slides] > 0.5
             begins = along & ~np.vstack([np.zeros((1, len(slides)), bool), along[:-1]])
-            number = np.where(crossed == BorderKind.GUARD, number, len(guards))
-            at_border = (crossed == BorderKind.GUARD) & ~leaves[number]
+            number = np.where(crossed == StepEnd.GUARD, number, len(guards))
+            at_border = (crossed == StepEnd.GUARD) & ~leaves[number]
             # A border that the motion slides along from there on has not been crossed.
             to_slide = np.append(np.any(begins, axis=1)[1:], False) & enters[number]
             into.slid[place] += int(begins.sum())

@@ -90,7 +90,7 @@ def _measure_in_doubles(members: Members) -> dict[str, Any] | None:
     return _measure_concrete(members, laws) | _known_fields(laws, layout)
 
 
-def _precision_of(trajectory, q) -> np.dtype:
+def _computed_dtype(trajectory, q) -> np.dtype:
     return q.dtype if trajectory.engine == "Diffrax" else DOUBLE
 
 
@@ -135,7 +135,7 @@ def sampled_path(members: Members) -> SampledPath:
     tolerances = run.tolerances and [members.shared(x, 0) for x in run.tolerances]
     steps = np.asarray(run.stats["num_accepted_steps"]).reshape(members.count)
     mode, q = None if run.mode is None else np.asarray(run.mode).reshape(ts.shape), members.flat(run.q)
-    outputs, precision = (q, members.flat(run.qdot), ts, mode), _precision_of(run, q)
+    outputs, precision = (q, members.flat(run.qdot), ts, mode), _computed_dtype(run, q)
     return _join_states(np, outputs, transitions, steps, tolerances, precision)
 
 
@@ -194,7 +194,7 @@ def _measure_traced(trajectory, axes, tree, steps):
         names.update(_known_fields(laws, layout))
         flat, (ts, tolerances) = jax.vmap(layout.flatten), times_and_tolerances
         more = transitions and (flat(transitions.q), flat(transitions.qdot), transitions.t, transitions.source)
-        outputs, precision = (flat(q), flat(qdot), ts, mode), _precision_of(trajectory, layout)
+        outputs, precision = (flat(q), flat(qdot), ts, mode), _computed_dtype(trajectory, layout)
         path = _join_states(jnp, outputs, more, steps, tolerances, precision)
         momenta, numbers = _common_conserved(laws) or (), eqx.filter(params, eqx.is_array)
         tolerances = (0.0, 0.0) if path.tolerances is None else path.tolerances
