@@ -513,23 +513,27 @@ def test_derivatives_of_a_cradle_that_is_struck(count, gap, power):
         return stiffness / (power + 1) * jnp.sum(jnp.maximum(q[:-1] - q[1:] - gap, 0.0) ** (power + 1))
 
     def rate(t, y):
-        q, v, dq, dv = y.reshape(4, count)
-        over = np.maximum(q[:-1] - q[1:] - gap, 0.0)
-        push, slope = stiffness * over**power, np.where(over > 0, power * stiffness * over ** (power - 1), 0.0)
-        forces = [np.append(0.0, f) - np.append(f, 0.0) for f in (push, slope * (dq[:-1] - dq[1:]))]
-        return np.concatenate([v, forces[0] / mass, dv, forces[1] / mass])
+        q, v = y.reshape(2, count)
+        push = stiffness * np.maximum(q[:-1] - q[1:] - gap, 0.0) ** power
+        return np.concatenate([v, (np.append(0.0, push) - np.append(push, 0.0)) / mass])
 
     speed, way, after = 0.1, 0.05, 2.5e-3
     touch = (way + gap) / speed
-    start = np.concatenate([gap * first, speed * first, touch * first, first])  # the variation of a free flight
-    by_speed = solve_ivp(rate, (0, after), start, method="DOP853", rtol=1e-13, atol=1e-16).y[3 * count :, -1]
+
+    def last_by_scipy(v):
+        start = np.concatenate([gap * first, v * first])  # at the end of a free flight
+        ends = 0.0, touch + after - (way + gap) / v
+        return solve_ivp(rate, ends, start, method="DOP853", rtol=1e-13, atol=1e-16).y[count:, -1]
+
+    # By differences: whether balls that fly side by side touch is rounding, and their variation grows where they do.
+    by_speed = (last_by_scipy(speed + 1e-7) - last_by_scipy(speed - 1e-7)) / 2e-7
     scene = lagjax.System(lambda q, v: 0.5 * mass * v @ v - potential(q))
 
     def last(v):
         return lagjax.simulate(scene, -way * first, v * first, np.array([0.0, touch + after]), rtol=1e-10).qdot[-1]
 
     for of in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(jax.jit(of(last))(speed), by_speed, atol=1e-5)
+        np.testing.assert_allclose(jax.jit(of(last))(speed), by_speed, rtol=1e-6, atol=1e-5)
 
 
 def test_balls_at_rest_that_touch_have_derivatives_by_where_they_are():
