@@ -2,6 +2,7 @@
 
     System(contacts=…) ─► ContactPlan ─► _contact_motion ─► ContactEnding, RoundRecord ─► Trajectory
                                           ├─ _contact_search: the events, by loops over numbers, laid out by _places
+                                          │    ├─ _contact_changes: what happens at one;  _contact_state: of a member
                                           │    ├─ _law: which contacts push, stick and slide in an impact
                                           │    └─ _scene_code: a scene as the search takes it, and its runs
                                           ├─ _replay: the same with derivatives;  _impact_derivatives: those of impulses

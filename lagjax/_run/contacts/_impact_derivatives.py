@@ -1,4 +1,4 @@
-"""Derivatives of the law of impacts. Only derivatives are used: velocities are those of `_contact_search.move`.
+"""Derivatives of the law of impacts: velocities themselves are those of `_contact_changes.apply_change`.
 
 With G the rows of k gaps and one-way velocities, and of r d slips, (K, n), q̇⁺ = q̇ + M⁻¹ Gᵀ E Λ, where E adds the
 friction −μ c of a contact that slides to its normal impulse. Newton's law of restitution with Coulomb friction, for all

@@ -19,7 +19,8 @@ import numpy as np
 from lagjax._engine.taylor import Line, Surfaces, move_to_zero, run_stretch
 from lagjax._interface import halves
 from lagjax._primitives import differentiable_where, limit_directions
-from lagjax._run.contacts._contact_search import HELD, POISSON
+from lagjax._run.contacts._contact_changes import POISSON
+from lagjax._run.contacts._contact_state import HELD
 from lagjax._run.contacts._impact_derivatives import (
     ActiveRows,
     ImpactRows,
@@ -147,7 +148,7 @@ class ContactReplay(Replay):
         return t + left, impulses[:k], lost, behind
 
     def _time_left(self, t, y, bounced, ends, vector, restitution):
-        """The remaining time of bounces that end at once, by `_contact_search.end_bounces`."""
+        """The remaining time of bounces that end at once, by `_contact_changes.end_bounces`."""
         x = self._opened(t, y, vector)
         along = jnp.concatenate([halves(y)[1], self._lines["ACCELERATION"](x), jnp.ones(1)])
         bends, later = jnp.split(self._lines["BENDS"](jnp.concatenate([x, along, jnp.zeros(x.size - along.size)])), 2)
