@@ -48,7 +48,7 @@ _LYAPUNOV = 5.0  # times 1/λ that a record is long: shorter ones are followed w
 # records from which on it pays.
 _SAMPLED, _SAMPLES_EACH, _PAYS = 64, 30, 4
 _SUSPECT, _SAMPLES_OF_LEVEL = 0.05, 4  # of the signals, left by a search; samples for each unknown in first samples
-# Shortest segments of a record, whose motion may_jump, from which on they come before other starts. Of up to 17 other
+# Shortest segments of a record, whose motion jumps, from which on they come before other starts. Of up to 17 other
 # starts cost less; of 51 to 115 these did not find the motion in a minute and more, and segments did in 13 to 27 CPU s.
 _LONG = 32
 _GRADIENT_STEPS = 3000  # of a descent by gradients
