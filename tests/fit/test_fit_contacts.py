@@ -1,11 +1,16 @@
 """`fit` of contacts and of hybrid motion by segments, of starts on closed contacts, and of one start for a record and
 the times of its impacts."""
 
+from types import SimpleNamespace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import stdtrit
+from scipy.stats import f
 
 import lagjax
+from lagjax._fit.search._search import _leaves_more
 
 ALONG, UP = np.array([np.cos(0.5), np.sin(0.5)]), np.array([-np.sin(0.5), np.cos(0.5)])
 INCLINE = lagjax.System(
@@ -95,6 +100,33 @@ def test_a_record_and_the_times_of_its_impacts_have_one_start():
     separate = lagjax.fit(BALL, [apart, record], first, transforms={k: BOUNDED[k] for k in first})
     assert both.information.covariance[1, 1] < 0.8 * separate.information.covariance[1, 1]  # of g
     assert both.log_density().names.count("starts[1].q") == 1 and len(both.log_density()) == 2 + 2 + 2
+
+
+def test_three_times_do_not_tell_how_exact_they_are():
+    """e, and what a record leaves open of the start, meet three times exactly, whatever their noise is."""
+    ts = np.linspace(0.0, 1.9, 41)
+    motion = lagjax.simulate(BALL, 1.0, 0.0, ts, {"g": 9.81, "e": 0.8})
+    record = lagjax.Record(ts, noisy(motion.q, 5e-3))
+    struck = noisy(np.asarray(motion.impacts.t)[:3], 1e-3, 1)
+    first = {"g": 9.0, "e": 0.7}
+    fit = lagjax.fit(BALL, [lagjax.Timings("floor", struck, 0.0, record), record], first)
+    assert not fit.ok and "meets all that was measured of times, 3 in number" in fit.message
+    assert fit.information.fitted == pytest.approx([1.0, 3.0], abs=1e-3)  # of g, e, and a start
+    assert fit.information.quantile(0.95) == pytest.approx(stdtrit(1, 0.975))
+
+
+def test_long_pieces_that_leave_more_than_chance_are_another_minimum():
+    """The F test of two fits of a linear model, one within the other."""
+    count, few, many = 1800, 9, 63
+    edge = 1.0 + f.isf(1e-4, many - few, count - many) * (many - few) / (count - many)
+
+    def ended(numbers: int, squares: float) -> SimpleNamespace:
+        likelihood = lambda trial, noise: -0.5 * count * np.log(squares)  # noqa: E731
+        residuals = SimpleNamespace(log_likelihood=likelihood, measured=count, free_states=numbers - 3)
+        return SimpleNamespace(residuals=residuals, trial=SimpleNamespace(u=np.zeros(3)), noise=None)
+
+    for squares, more in ((0.9, False), (0.999 * edge, False), (1.001 * edge, True), (100.0, True)):
+        assert _leaves_more(ended(few, squares), ended(many, 1.0)) == more
 
 
 def test_a_record_that_times_begin_with_must_be_there_and_begin_then():

@@ -47,6 +47,7 @@ _LOST = 1.0 / np.finfo(float).eps
 _FAR = 0.1  # of the least singular value, told by a bound of it: an inverse of F columns is right to so much
 # The length of a column below which it is zero: one over it must have a square, and some room, among finite numbers.
 _NOTHING = 1e-140
+_DETERMINES = 0.5  # numbers: a signal that determines fewer widens no interval
 _UNFELT = 1e-10  # of the largest singular value of a start: a direction of it that nothing depends on
 
 
@@ -85,12 +86,11 @@ class Information(NamedTuple):
         return self._replace(covariance=covariance, white=white, null=null, confirmed=confirmed)
 
     def quantile(self, level: float) -> float:
-        """Student's t quantile of a level; degrees of freedom: effective samples minus fitted numbers. Those of signals
-        count as Welch and Satterthwaite have it, for an average of what was fitted."""
+        """Student's t quantile of a level; degrees of freedom: effective samples minus fitted numbers, of the signal
+        that has the fewest of those that determine any."""
         require_level(level)
-        share = self.fitted / max(self.fitted.sum(), _NOTHING)
-        uncertainty = float(np.sum(share**2 / np.maximum(self.effective - self.fitted, 1.0)))
-        return float(stdtrit(1.0 / max(uncertainty, _NOTHING), 0.5 + 0.5 * level))
+        spare = np.where(self.fitted > _DETERMINES, self.effective - self.fitted, np.inf)
+        return float(stdtrit(max(float(spare.min()), 1.0), 0.5 + 0.5 * level))
 
 
 def require_level(level) -> None:
