@@ -1,20 +1,12 @@
 """`fit` of contacts and of hybrid motion by segments, of starts on closed contacts, and of one start for a record and
 the times of its impacts."""
 
-from types import SimpleNamespace
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.special import stdtrit
-from scipy.stats import f
 
 import lagjax
-from lagjax._fit.model._pieces import Piece
-from lagjax._fit.model._residuals import Point
-from lagjax._fit.search._descent import Descent
-from lagjax._fit.search._multistart import run_multistart
-from lagjax._fit.search._search import _leaves_more
 
 ALONG, UP = np.array([np.cos(0.5), np.sin(0.5)]), np.array([-np.sin(0.5), np.cos(0.5)])
 INCLINE = lagjax.System(
@@ -117,38 +109,6 @@ def test_three_times_do_not_tell_how_exact_they_are():
     assert not fit.ok and "meets all that was measured of times, 3 in number" in fit.message
     assert fit.information.fitted == pytest.approx([1.0, 3.0], abs=1e-3)  # of g, e, and a start
     assert fit.information.quantile(0.95) == pytest.approx(stdtrit(1, 0.975))
-
-
-def test_long_pieces_that_leave_more_than_chance_are_another_minimum():
-    """The F test of two fits of a linear model, one within the other."""
-    count, few, many = 1800, 9, 63
-    edge = 1.0 + f.isf(1e-4, many - few, count - many) * (many - few) / (count - many)
-
-    def ended(numbers: int, squares: float) -> SimpleNamespace:
-        likelihood = lambda trial, noise: -0.5 * count * np.log(squares)
-        residuals = SimpleNamespace(log_likelihood=likelihood, measured=count, free_states=numbers - 3)
-        return SimpleNamespace(residuals=residuals, trial=SimpleNamespace(u=np.zeros(3)), noise=None)
-
-    for squares, more in ((0.9, False), (0.999 * edge, False), (1.001 * edge, True), (100.0, True)):
-        assert _leaves_more(ended(few, squares), ended(many, 1.0)) == more
-
-
-def test_pieces_that_follow_the_motion_are_better_than_a_whole_record_that_does_not():
-    """The best of several searches, of which the first ends in two pieces."""
-    ts, truth = np.linspace(0.0, 3.2, 41), {"g": 9.81, "e": 0.8}
-    motion = lagjax.simulate(BALL, 1.0, 0.0, ts, truth)
-    record = lagjax.Record(ts, noisy(motion.q, 5e-3), start=(1.0, 0.0))
-    whole = (done := lagjax.fit(BALL, record, truth)).residual_function
-    cut = whole.with_pieces([Piece(0, np.arange(20)), Piece(0, np.arange(20, 41))], np.ones(2, bool))
-    states = np.stack([motion.q, motion.qdot], axis=1)
-    ends = [(whole, Point(0.5 * done.u, states[:1])), (cut, Point(done.u, states[[0, 20]]))]
-
-    def search(point: Point) -> Descent:
-        of, end = ends.pop() if len(ends) > 1 else ends[0]
-        trial = of.evaluate(end)
-        return Descent(of, trial, of.noise_scale(trial, lagjax.Gaussian()), True, 1, "")
-
-    assert run_multistart(whole, search, Point(done.u, states[:1]), 2, 0)[0].residuals is cut
 
 
 def test_a_record_that_times_begin_with_must_be_there_and_begin_then():

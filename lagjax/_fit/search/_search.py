@@ -362,10 +362,10 @@ def _last_followed_level(levels_done: list[Descent]) -> int:
 
 def _leaves_more(done: Descent, other: Descent) -> bool:
     """True where a search leaves more, beyond chance, than another one of more pieces does: an F test."""
-    each = (one.residuals.log_likelihood(one.trial, one.noise) for one in (done, other))
+    least, more = (one.residuals.log_likelihood(one.trial, one.noise) for one in (done, other))
     count, few, many = done.residuals.measured, *(len(one.trial.u) + one.residuals.free_states for one in (done, other))
-    freedom, left, gain = many - few, count - many, -np.subtract(*each)
-    return min(freedom, left) > 0 and fdtrc(freedom, left, np.expm1(2 * gain / count) * left / freedom) < _FALSELY
+    ratio, freedom, left = np.exp(2 * (more - least) / count), many - few, count - many  # of the squares left
+    return min(freedom, left) > 0 and fdtrc(freedom, left, (ratio - 1) * left / freedom) < _FALSELY
 
 
 def _trajectory_separation(done: Descent) -> float:
