@@ -4,6 +4,7 @@ the times of its impacts."""
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import stdtrit
 
 import lagjax
 
@@ -95,6 +96,19 @@ def test_a_record_and_the_times_of_its_impacts_have_one_start():
     separate = lagjax.fit(BALL, [apart, record], first, transforms={k: BOUNDED[k] for k in first})
     assert both.information.covariance[1, 1] < 0.8 * separate.information.covariance[1, 1]  # of g
     assert both.log_density().names.count("starts[1].q") == 1 and len(both.log_density()) == 2 + 2 + 2
+
+
+def test_three_times_do_not_tell_how_exact_they_are():
+    """e, and what a record leaves open of the start, meet three times exactly, whatever their noise is."""
+    ts = np.linspace(0.0, 1.9, 41)
+    motion = lagjax.simulate(BALL, 1.0, 0.0, ts, {"g": 9.81, "e": 0.8})
+    record = lagjax.Record(ts, noisy(motion.q, 5e-3))
+    struck = noisy(np.asarray(motion.impacts.t)[:3], 1e-3, 1)
+    first = {"g": 9.0, "e": 0.7}
+    fit = lagjax.fit(BALL, [lagjax.Timings("floor", struck, 0.0, record), record], first)
+    assert not fit.ok and "meets all that was measured of times, 3 in number" in fit.message
+    assert fit.information.fitted == pytest.approx([1.0, 3.0], abs=1e-3)  # of g, e, and a start
+    assert fit.information.quantile(0.95) == pytest.approx(stdtrit(1, 0.975))
 
 
 def test_a_record_that_times_begin_with_must_be_there_and_begin_then():

@@ -62,7 +62,7 @@ def test_a_bounded_profile_has_the_ends_of_a_fit_with_the_value_kept(done):
     squares = [float(np.sum(np.square(fit.residuals[0]))) for fit in (done, kept)]
     deviance = (squares[1] - squares[0]) / (squares[0] / (len(TS) - 4))
     assert deviance == pytest.approx(profile.threshold, rel=1e-3)
-    assert profile.threshold == pytest.approx(stdtrit(len(TS) - 2, 0.975) ** 2, rel=1e-6)
+    assert profile.threshold == pytest.approx(stdtrit(len(TS) - 4, 0.975) ** 2, rel=1e-6)
 
 
 def test_a_profile_finds_the_other_minimum(done):

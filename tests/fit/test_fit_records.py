@@ -1,16 +1,22 @@
 """`lagjax.per_record`: numbers that every record has of its own, against truth and against the same fit by hand."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import f
 
 import lagjax
 from lagjax import per_record
 from lagjax._fit.model._parameters import Unknowns
+from lagjax._fit.model._pieces import Piece
 from lagjax._fit.model._residuals import Point, compress_rows
 from lagjax._fit.result._information import eliminate_starts, parameter_rows
 from lagjax._fit.search import _descent
+from lagjax._fit.search._multistart import run_multistart
+from lagjax._fit.search._search import _leaves_more
 
 TS = np.linspace(0.0, 6.0, 151)
 STIFFNESS, FRICTION = 4.0, 0.2
@@ -351,3 +357,33 @@ def test_a_trial_in_two_parts_is_that_at_once_and_one_of_some_records_is_a_part_
         for name in ("residuals", "slopes"):
             for found, right in zip(getattr(some, name), getattr(part.evaluate(some.point), name), strict=True):
                 np.testing.assert_allclose(found, right, atol=1e-9)
+
+
+def test_long_pieces_that_leave_more_than_chance_are_another_minimum():
+    """The F test of two fits of a linear model, one within the other."""
+    count, few, many = 1800, 9, 63
+    edge = 1.0 + f.isf(1e-4, many - few, count - many) * (many - few) / (count - many)
+
+    def ended(numbers: int, squares: float) -> SimpleNamespace:
+        likelihood = lambda trial, noise: -0.5 * count * np.log(squares)
+        residuals = SimpleNamespace(log_likelihood=likelihood, measured=count, free_states=numbers - 3)
+        return SimpleNamespace(residuals=residuals, trial=SimpleNamespace(u=np.zeros(3)), noise=None)
+
+    for squares, more in ((0.9, False), (0.999 * edge, False), (1.001 * edge, True), (100.0, True)):
+        assert _leaves_more(ended(few, squares), ended(many, 1.0)) == more
+
+
+def test_pieces_that_follow_the_motion_are_better_than_a_whole_record_that_does_not():
+    """The best of several searches, of which the first ends in two pieces."""
+    states = np.stack([np.cos(2 * TS), -2 * np.sin(2 * TS)], axis=1)
+    record = lagjax.Record(TS, noisy(states[:, 0], 0), start=(1.0, 0.0))
+    whole = (fit := lagjax.fit(SPRING, record, {"k": 4.1})).residual_function
+    cut = whole.with_pieces([Piece(0, np.arange(80)), Piece(0, np.arange(80, 151))], np.ones(2, bool))
+    ends = [(whole, Point(0.5 * fit.u, states[:1])), (cut, Point(fit.u, states[[0, 80]]))]
+
+    def search(point):
+        of, end = ends.pop() if len(ends) > 1 else ends[0]
+        trial = of.evaluate(end)
+        return _descent.Descent(of, trial, of.noise_scale(trial, lagjax.Gaussian()), True, 1, "")
+
+    assert run_multistart(whole, search, Point(fit.u, states[:1]), 2, 0)[0].residuals is cut

@@ -47,6 +47,7 @@ _LOST = 1.0 / np.finfo(float).eps
 _FAR = 0.1  # of the least singular value, told by a bound of it: an inverse of F columns is right to so much
 # The length of a column below which it is zero: one over it must have a square, and some room, among finite numbers.
 _NOTHING = 1e-140
+_DETERMINES = 0.5  # numbers: a signal that determines fewer widens no interval
 _UNFELT = 1e-10  # of the largest singular value of a start: a direction of it that nothing depends on
 
 
@@ -57,6 +58,7 @@ class Information(NamedTuple):
     - `null` (F, K): the K directions of u that nothing depends on, as far as rounding lets one tell; `confirmed` are
       those among them that nothing depends on.
     - `effective` (S,): the number of samples of each signal that independent ones would need to say as much.
+    - `fitted` (S,): how many of all fitted numbers, starts among them, each signal determines.
     - `correlation` (S,): the correlation of neighbouring residuals, less what rounding makes of it.
     - `white` (F, F): the covariance if residuals were white, zero where nothing is seen; `lost`: by how much variances
       are larger because unknowns were fitted.
@@ -66,6 +68,7 @@ class Information(NamedTuple):
     null: np.ndarray
     confirmed: np.ndarray
     effective: np.ndarray
+    fitted: np.ndarray
     correlation: np.ndarray
     white: np.ndarray
     lost: float
@@ -83,10 +86,11 @@ class Information(NamedTuple):
         return self._replace(covariance=covariance, white=white, null=null, confirmed=confirmed)
 
     def quantile(self, level: float) -> float:
-        """Student's t quantile of a level; degrees of freedom: effective samples minus parameters."""
+        """Student's t quantile of a level; degrees of freedom: effective samples minus fitted numbers, of the signal
+        that has the fewest of those that determine any."""
         require_level(level)
-        dof = max(float(self.effective.sum()) - len(self.covariance), 1.0)
-        return float(stdtrit(dof, 0.5 + 0.5 * level))
+        spare = np.where(self.fitted > _DETERMINES, self.effective - self.fitted, np.inf)
+        return float(stdtrit(max(float(spare.min()), 1.0), 0.5 + 0.5 * level))
 
 
 def require_level(level) -> None:
@@ -113,7 +117,13 @@ def information(descent: Descent) -> Information:
     weighted = [factor[..., None] * slopes for factor, slopes in zip(factors, trial.slopes, strict=True)]
     rows_of = [eliminate_starts(triangles[residuals.leads[b.rows]], own, states) / unit_of[b.rows]
                for b, own in zip(residuals.batches, weighted, strict=True)]  # fmt: skip
-    laws = autocorrelations(residuals, trial, noise, _fitted_products(residuals, triangles, weighted, rows_of, half))
+    products = _fitted_products(residuals, triangles, weighted, rows_of, half)
+    laws, fitted = autocorrelations(residuals, trial, noise, products), products[:, 0]
+    # Each signal lost variance where it was fitted; `lost` is the average of that.
+    samples = np.array([law.count / law.time for law in laws])
+    left = np.maximum(np.append(samples - fitted, (samples - fitted).sum()), 1.0)
+    own_loss = samples / left[:-1] * left[-1] / samples.sum()
+    rows_of = [own * np.sqrt(own_loss)[:, None] for own in rows_of]
     middle, effective, correlation = _noisy_square(residuals, trial, noise, rows_of, laws, prior / unit)
     # Student's t tells (ν+1)/(ν+3) of what a Gaussian of the same σ tells; the dof that were used up are counted.
     used = free - null.shape[1] + residuals.free_states
@@ -126,7 +136,7 @@ def information(descent: Descent) -> Information:
     covariance[:, unseen] = np.nan
     covariance[unseen, unseen] = np.inf
     confirmed = null if not null.size else confirmed_null(residuals, trial, null)
-    return Information(covariance, null, confirmed, effective, correlation, white, float(lost))
+    return Information(covariance, null, confirmed, effective, fitted, correlation, white, float(lost))
 
 
 def _noisy_square(residuals: Residuals, trial: Trial, noise: NoiseScale, rows_of: list, laws: list, prior: np.ndarray):

@@ -40,6 +40,7 @@ _ASIDE, _KEPT = 4.0, 1e6  # standard errors: how far a kink is one that interval
 _DISAGREE = 5.0  # standard deviations of a shift: twenty records of ten parameters show it in one of 1e4 fits
 _FEW_LINES = 64  # that a coarse sensor shows, from whose values alone limits are not told (`find_limits`)
 _FEWEST_BEYOND = 3  # samples, each of which shows the next line with a chance of a half at least, if there is one
+_SPARE = 0.5  # samples more than numbers fitted through them, without which the noise of a signal is not told
 _SEEN = 1e-5  # of the largest singular value of columns in units of their standard deviations
 _OWN = 0.2  # of the motion left in a record, explained by parameters of its own: 0.9 and more for another machine
 
@@ -79,9 +80,11 @@ def verdict(
         if records:
             parts += describe_sensors(records, law, part.signals.names, part.sensor, own.sigma)
     parts += [] if left.motion else _describe_missed_limits(residuals, descent.trial)
+    met = _describe_met_signals(residuals, known)
+    parts += met
     if np.nanmax(known.correlation) > _CORRELATED:
         parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")
-    ok = descent.converged and not (unseen or left.motion or apart or bent or astray)
+    ok = descent.converged and not (unseen or left.motion or apart or bent or astray or met)
     ok &= not any("take noise=" in text or TOO_COARSE in text for text in parts)
     if not ok or at_ends or labels:
         still = [x for part in residuals.parts for x in constant_signals(part.records, part.signals.names)]
@@ -98,6 +101,16 @@ def is_doubtful(descent: Descent) -> bool:
 
 def _has_motion_left(known: Information, left: Unexplained) -> bool:
     return left.doubted and bool(np.nanmax(known.correlation) > _CORRELATED)
+
+
+def _describe_met_signals(residuals: Residuals, known: Information) -> list[str]:
+    """Sentences for signals with no more samples than numbers fitted through them, which residuals do not know."""
+    samples = (residuals.weights > 0).sum(axis=0)
+    return [
+        f"What is fitted meets all that was measured of {residuals.names[s]}, {samples[s]} in number: how large its "
+        "noise is nobody can tell, and intervals are too narrow. Measure more of it, or fit fewer numbers."
+        for s in np.flatnonzero((samples > 0) & (samples - known.fitted < _SPARE))
+    ]
 
 
 def _describe_missed_limits(residuals: Residuals, trial: Trial) -> list[str]:

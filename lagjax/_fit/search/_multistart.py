@@ -17,6 +17,7 @@ import numpy as np
 from lagjax._fit.model._noise import Gaussian, NoiseScale
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals
 from lagjax._fit.search._descent import Descent, minimise
+from lagjax._fit.search._unexplained import measure_unexplained
 from lagjax._show import even_places
 
 _SHORT_TRIALS, _ENOUGH = 9, 1e-2  # of the short search; the fall of half the sum of squares, per sample, that ends it
@@ -100,7 +101,8 @@ def run_multistart(
             continue
         if place is not None:
             misfits[place] = misfit(done[-1].noise, done[-1].residuals)
-    best = max(done, key=lambda one: (one.residuals is residuals, one.residuals.log_likelihood(one.trial, one.noise)))
+    followed = [one for one in done if one.residuals is residuals and not measure_unexplained(one).motion]
+    best = max(followed or done, key=lambda one: one.residuals.log_likelihood(one.trial, one.noise))
     misfits = np.sort(misfits)
     misfits[0] = min(misfits[0], misfit(best.noise, best.residuals))
     return best, Waterfall(misfits)

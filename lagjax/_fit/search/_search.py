@@ -20,6 +20,7 @@ import sys
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import fdtrc
 
 from lagjax._equations import has_constraints
 from lagjax._fit.model._noise import AbstractNoise
@@ -43,6 +44,7 @@ _LOOSE = 3.0  # standard deviations of u about its first value on these levels, 
 _TRIALS, _TRIALS_OF_LEVEL = 300, 20
 _WORSE = 5.0  # times more that a join may leave: without friction it was 3, beyond the horizon 10 and more
 _LOST = 2  # levels that may be lost: after one the next may find the motion again, with better parameters
+_FALSELY = 1e-4  # of a sound fit in long pieces, that it is taken for a false minimum
 _LYAPUNOV = 5.0  # times 1/λ that a record is long: shorter ones are followed whole
 # Records of a sample that is searched before all of them, the samples that it has for each unknown, and times as many
 # records from which on it pays.
@@ -109,7 +111,7 @@ class Search:
             point, levels_done = self._fit_growing_segments(point)
         good, all_cut = _last_followed_level(levels_done), all(self.readers)
         if len(levels_done) - good > _LOST and all_cut:
-            return self._search_pieces(levels_done[good], levels_done[-1])
+            return self._search_pieces(levels_done[: good + 1], levels_done[-1])
         done, lost = None, LostMotion()
         try:
             done = self._minimise_whole(point)
@@ -118,7 +120,7 @@ class Search:
         if levels_done and all_cut and (done is None or not done.converged or measure_unexplained(done).motion):
             good = _last_followed_level([*levels_done, *([] if done is None else [done])])
             if good < len(levels_done) and misfit(levels_done[good].noise, levels_done[good].residuals) < _COARSE:
-                return self._search_pieces(levels_done[good], done)
+                return self._search_pieces(levels_done[: good + 1], done)
         if self._knows_starts() and (done is None or measure_unexplained(done).share > _SUSPECT):
             done = self._search_beginnings(point, done)
         if done is None:
@@ -177,13 +179,19 @@ class Search:
             return max(both, key=lambda one: residuals.log_likelihood(one.trial, one.noise))
         return done
 
-    def _search_pieces(self, level: Descent, joined: Descent | None) -> Descent:
-        part, pieces = level.residuals, level.residuals.pieces
-        done = minimise(part, level.trial, self.law, _ENOUGH, _TRIALS)
+    def _search_pieces(self, levels_done: list[Descent], joined: Descent | None) -> Descent:
+        """The search of the last level; where the motion jumps, of the last that leaves no more than those before it:
+        longer pieces may end in another minimum."""
+        *shorter, level = levels_done
+        done = minimise(level.residuals, level.trial, self.law, _ENOUGH, _TRIALS)
+        if self.jumping.any() and any(_leaves_more(done, other) for other in shorter):
+            return self._search_pieces(shorter, done)
         worse = "fails"
         if joined is not None:
-            worse = f"leaves {misfit(joined.noise, joined.residuals) / misfit(done.noise, part):.2g} times more"
-        text = f"The records are followed in {len(pieces)} pieces, each with a start of its own: to join them {worse}"
+            more = misfit(joined.noise, joined.residuals) / misfit(done.noise, done.residuals)
+            worse = f"leaves {more:.2g} times more"
+        count = len(done.residuals.pieces)
+        text = f"The records are followed in {count} pieces, each with a start of its own: to join them {worse}"
         if is_chaotic := (growth := _trajectory_separation(done)) > _LYAPUNOV:
             text += f", because motions that begin side by side part e^{growth:.0f}-fold over a record."
         else:
@@ -350,6 +358,14 @@ def _last_followed_level(levels_done: list[Descent]) -> int:
         if now <= _WORSE ** (k - good) * last:
             good, last = k, now
     return good
+
+
+def _leaves_more(done: Descent, other: Descent) -> bool:
+    """True where a search leaves more, beyond chance, than another one of more pieces does: an F test."""
+    least, more = (one.residuals.log_likelihood(one.trial, one.noise) for one in (done, other))
+    count, few, many = done.residuals.measured, *(len(one.trial.u) + one.residuals.free_states for one in (done, other))
+    ratio, freedom, left = np.exp(2 * (more - least) / count), many - few, count - many  # of the squares left
+    return min(freedom, left) > 0 and fdtrc(freedom, left, (ratio - 1) * left / freedom) < _FALSELY
 
 
 def _trajectory_separation(done: Descent) -> float:
