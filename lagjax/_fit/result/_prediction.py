@@ -55,6 +55,12 @@ class Prediction(NamedTuple):
     deviation: PyTree
     widths: NoiseScale
 
+    def __repr__(self) -> str:
+        missed = [np.asarray(x).reshape(len(x), -1) for x in jax.tree.leaves(self.residuals)]
+        squares = np.concatenate([np.nansum(x**2, axis=0) / np.isfinite(x).sum(axis=0).clip(1) for x in missed])
+        each = [f"{a:.3g} RMS (noise σ {b:.3g})" for a, b in zip(np.sqrt(squares), self.widths.sigma, strict=True)]
+        return f"Prediction, which misses {len(missed[0])} samples by {', '.join(each)}; its motion:\n{self.trajectory}"
+
     def bands(self, level: float = LEVEL) -> tuple[PyTree, PyTree]:
         """(low, high) between which a new sample of weight one falls with probability `level`, noise included.
 
