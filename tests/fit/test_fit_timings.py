@@ -89,6 +89,10 @@ def test_records_and_timings_of_one_motion_are_fitted_together(exact):
     assert (np.abs([both.params["c"] - 0.05, both.params["g"] - 9.81]) < 4 * deviation).all()
     assert abs(both.params["g"] - alone.params["g"]) < 3 * deviation[1]
     assert both.predict(both.records[1]).residuals.std() == pytest.approx(both.rms["q"], rel=0.1)
+    # Four times, of which two unknowns can follow as many, hardly tell their scatter.
+    first = {name: t[:2] for name, t in times.items()}
+    few = lagjax.fit(SCENE, [timings(first), lagjax.Record(ts, noisy)], FIRST)
+    assert "The scatter of times is told by 4 samples" in few.message and "The scatter" not in both.message
 
 
 def test_a_record_that_is_not_of_the_scene_beside_timings_ends_in_a_verdict(exact):

@@ -58,6 +58,7 @@ class Information(NamedTuple):
       those among them that nothing depends on.
     - `effective` (S,): the number of samples of each signal that independent ones would need to say as much.
     - `correlation` (S,): the correlation of neighbouring residuals, less what rounding makes of it.
+    - `spent` (S,): how many samples of each signal the unknowns were fitted to: what its σ is not told by.
     - `white` (F, F): the covariance if residuals were white, zero where nothing is seen; `lost`: by how much variances
       are larger because unknowns were fitted.
     """
@@ -67,6 +68,7 @@ class Information(NamedTuple):
     confirmed: np.ndarray
     effective: np.ndarray
     correlation: np.ndarray
+    spent: np.ndarray
     white: np.ndarray
     lost: float
 
@@ -113,7 +115,8 @@ def information(descent: Descent) -> Information:
     weighted = [factor[..., None] * slopes for factor, slopes in zip(factors, trial.slopes, strict=True)]
     rows_of = [eliminate_starts(triangles[residuals.leads[b.rows]], own, states) / unit_of[b.rows]
                for b, own in zip(residuals.batches, weighted, strict=True)]  # fmt: skip
-    laws = autocorrelations(residuals, trial, noise, _fitted_products(residuals, triangles, weighted, rows_of, half))
+    fitted = _fitted_products(residuals, triangles, weighted, rows_of, half)
+    laws = autocorrelations(residuals, trial, noise, fitted)
     middle, effective, correlation = _noisy_square(residuals, trial, noise, rows_of, laws, prior / unit)
     # Student's t tells (ν+1)/(ν+3) of what a Gaussian of the same σ tells; the dof that were used up are counted.
     used = free - null.shape[1] + residuals.free_states
@@ -126,7 +129,7 @@ def information(descent: Descent) -> Information:
     covariance[:, unseen] = np.nan
     covariance[unseen, unseen] = np.inf
     confirmed = null if not null.size else confirmed_null(residuals, trial, null)
-    return Information(covariance, null, confirmed, effective, correlation, white, float(lost))
+    return Information(covariance, null, confirmed, effective, correlation, fitted[:, 0], white, float(lost))
 
 
 def _noisy_square(residuals: Residuals, trial: Trial, noise: NoiseScale, rows_of: list, laws: list, prior: np.ndarray):

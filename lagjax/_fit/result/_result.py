@@ -193,7 +193,9 @@ class Fit:
         def numbers(u) -> PyTree:
             return function(self.parameters.restore_records(self.parameters.numbers(u, jnp)))
 
-        return jax.tree.map(lambda slopes: deviations(np.asarray(slopes), self.information), jax.jacobian(numbers)(self.u))
+        return jax.tree.map(
+            lambda slopes: deviations(np.asarray(slopes), self.information), jax.jacobian(numbers)(self.u)
+        )
 
     @with_doubles
     def profile(self, name: str, level: float = LEVEL) -> Profile:
