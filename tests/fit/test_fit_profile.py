@@ -136,6 +136,8 @@ def test_bands_hold_new_samples_and_widen_away_from_the_data(done):
     assert str(prediction).startswith(f"Prediction, which misses {len(TS)} samples by 0.0")
     # With all data the standard deviation of the curve is that of the least squares: the trace of the hat matrix.
     whole = done.predict(done.records[0]).deviation
+    with pytest.raises(TypeError, match=r"Only a .* is predicted"):
+        done.predict(TS)
     assert np.sum((whole / done.noise["q"].sigma) ** 2) == pytest.approx(4 * len(TS) / (len(TS) - 4), rel=0.02)
 
 

@@ -81,10 +81,11 @@ class Prediction(NamedTuple):
 
 def predict_record(fit, record: Record, system: str | None) -> Prediction:
     """The motion of the scene of a `Fit` over a record of the system of this name; see `Fit.predict`."""
-    [record], part = require_records([record]), fit.residual_function.find_part(system)
+    part = fit.residual_function.find_part(system)
     first = next((one for one in part.records if isinstance(one, Record)), None)
     if not isinstance(record, Record) or first is None:
         raise TypeError("Only a lagjax.Record is predicted, after a fit of some: for times ask lagjax.crossings.")
+    [record] = require_records([record])
     if record.structure != first.structure:
         raise ValueError("The record has different signals from those of the fit.")
     if record.input_structure != first.input_structure:
