@@ -198,6 +198,7 @@ def fit_tosses(scene, tosses):
 
 EDGES = [(i, j) for i in range(8) for j in range(i) if np.abs(CORNERS[i] - CORNERS[j]).sum() == 2]
 BOARD = np.array([[-2.0, -3, 0], [9, -3, 0], [9, 5, 0], [-2, 5, 0], [-2, -3, 0]])
+BOARD_BELOW = 1.8 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [-1, -1, 0]])
 SHOWN = (0.1, 0.2, LATER)  # s
 
 
@@ -256,11 +257,14 @@ def draw_followed(scene, tosses, laws, off):
     for name, law in laws.items():
         cubes[name] = follow_tosses(scene, [toss], law, numbers[None])[0], colors[name], 1
     for k, axis in enumerate(axes[1:]):
+        below = toss[numbers[k], :3] * [1.0, 1.0, 0.0]  # on the board
+        axis.plot(*np.asarray(look(below + BOARD_BELOW)).T, color="0.85")
+        x, y = look(below)
         for name, (pictures, color, width) in cubes.items():
             lines = edge_lines(seen_state(pictures[k]))
             axis.plot(*lines, color=color, lw=width, solid_capstyle="round", label=[name] + 11 * ["_"])
         axis.set_title(f"{SHOWN[k]} s")
-        axis.set(aspect="equal")
+        axis.set(aspect="equal", xlim=(x - 2.7, x + 2.7), ylim=(y - 1.2, y + 4.0))
         axis.axis("off")
     axes[2].legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=3, title="a toss of median error")
     Path("out").mkdir(exist_ok=True)

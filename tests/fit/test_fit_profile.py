@@ -133,8 +133,11 @@ def test_bands_hold_new_samples_and_widen_away_from_the_data(done):
     assert 0.90 < np.mean(inside) < 0.98, np.mean(inside)
     assert prediction.deviation[-20:].mean() > 2 * prediction.deviation[20:40].mean()
     assert np.isnan(prediction.residuals[half:]).all() and np.isfinite(prediction.values).all()
+    assert str(prediction).startswith(f"Prediction, which misses {len(TS)} samples by 0.0")
     # With all data the standard deviation of the curve is that of the least squares: the trace of the hat matrix.
     whole = done.predict(done.records[0]).deviation
+    with pytest.raises(TypeError, match=r"Only a .* is predicted"):
+        done.predict(TS)
     assert np.sum((whole / done.noise["q"].sigma) ** 2) == pytest.approx(4 * len(TS) / (len(TS) - 4), rel=0.02)
 
 
@@ -147,3 +150,15 @@ def test_a_prediction_that_depends_on_what_is_seen_has_a_band():
     )
     assert len(free.unseen) == 1
     np.testing.assert_allclose(free.predict(one).deviation, kept.predict(one).deviation, rtol=1e-3)
+
+
+def test_what_is_computed_from_parameters_has_the_deviation_of_their_covariance(done):
+    frequency = done.deviation(lambda params: {"f": params["root"] / (2 * np.pi), "zero": 0 * params["c"]})
+    variance = done.covariance["params['root']", "params['root']"]
+    assert frequency["f"] == pytest.approx(np.sqrt(variance) / (2 * np.pi), rel=1e-9) and frequency["zero"] == 0.0
+    # Of a mass and a stiffness of which only the ratio is seen, the ratio alone has a finite one.
+    free = lagjax.fit(DAMPED_SPRING, record(), {"m": 1.0, "k": 2.25, "c": 0.1})
+    found = free.deviation(
+        lambda params: np.array([1.0, 0.0]) * params["k"] / params["m"] + np.array([0.0, 1.0]) * params["m"]
+    )
+    assert found[0] == pytest.approx(np.sqrt(variance) * 2 * done.params["root"], rel=1e-2) and np.isinf(found[1])

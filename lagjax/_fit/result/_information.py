@@ -294,6 +294,11 @@ def signal_deviations(slopes: np.ndarray, states: int, start: np.ndarray, follow
     covariance `start` (2n, 2n) of its own, and `follows` (2n, F) the parameters."""
     a = slopes[..., :states]
     along = slopes[..., states:] - a @ follows
-    variance = np.einsum("tsf,fg,tsg->ts", along, known.identifiable, along) + np.einsum("tsi,ij,tsj->ts", a, start, a)
-    depends_on_unseen = (np.abs(along @ known.null) > 1e-6 * np.abs(along).max(initial=0.0)).any(axis=-1)
-    return np.where(depends_on_unseen, np.inf, np.sqrt(np.maximum(variance, 0.0)))
+    return np.hypot(deviations(along, known), np.sqrt(np.einsum("tsi,ij,tsj->ts", a, start, a).clip(0.0)))
+
+
+def deviations(slopes: np.ndarray, known: Information) -> np.ndarray:
+    """The standard deviations (…) of numbers with derivatives (…, F) by u; infinite where one is not seen."""
+    variance = np.einsum("...f,fg,...g->...", slopes, known.identifiable, slopes).clip(0.0)
+    unseen = (np.abs(slopes @ known.null) > 1e-6 * np.abs(slopes).max(initial=0.0)).any(axis=-1)
+    return np.where(unseen, np.inf, np.sqrt(variance))

@@ -55,6 +55,12 @@ class Prediction(NamedTuple):
     deviation: PyTree
     widths: NoiseScale
 
+    def __repr__(self) -> str:
+        missed = [np.asarray(x).reshape(len(x), -1) for x in jax.tree.leaves(self.residuals)]
+        squares = np.concatenate([np.nansum(x**2, axis=0) / np.isfinite(x).sum(axis=0).clip(1) for x in missed])
+        each = [f"{a:.3g} RMS (noise σ {b:.3g})" for a, b in zip(np.sqrt(squares), self.widths.sigma, strict=True)]
+        return f"Prediction, which misses {len(missed[0])} samples by {', '.join(each)}; its motion:\n{self.trajectory}"
+
     def bands(self, level: float = LEVEL) -> tuple[PyTree, PyTree]:
         """(low, high) between which a new sample of weight one falls with probability `level`, noise included.
 
@@ -75,10 +81,11 @@ class Prediction(NamedTuple):
 
 def predict_record(fit, record: Record, system: str | None) -> Prediction:
     """The motion of the scene of a `Fit` over a record of the system of this name; see `Fit.predict`."""
-    [record], part = require_records([record]), fit.residual_function.find_part(system)
+    part = fit.residual_function.find_part(system)
     first = next((one for one in part.records if isinstance(one, Record)), None)
     if not isinstance(record, Record) or first is None:
         raise TypeError("Only a lagjax.Record is predicted, after a fit of some: for times ask lagjax.crossings.")
+    [record] = require_records([record])
     if record.structure != first.structure:
         raise ValueError("The record has different signals from those of the fit.")
     if record.input_structure != first.input_structure:

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
@@ -21,7 +23,7 @@ from lagjax._fit.model._residuals import Point, Residuals, Trial
 from lagjax._fit.result._comparison import Comparison, comparison
 from lagjax._fit.result._experiments import Experiments, rank_experiments
 from lagjax._fit.result._identifiability import sentence_on_rest, unseen_sentences
-from lagjax._fit.result._information import LEVEL, Information, information
+from lagjax._fit.result._information import LEVEL, Information, deviations, information
 from lagjax._fit.result._prediction import Prediction, planned_rows, predict_record
 from lagjax._fit.result._profile import Profile, profile
 from lagjax._fit.result._report import draw_record, lab_book, recordings, render_page
@@ -179,6 +181,21 @@ class Fit:
             numbers[self.parameters.free_places] = values
             ends.append(self.parameters.restore_records(numbers))
         return ends[0], ends[1]
+
+    @with_doubles
+    def deviation(self, function: Callable) -> PyTree:
+        """The standard deviation of what `function(params)` returns, by its derivatives: of a learned potential at a
+        point, `fit.deviation(lambda params: V(0.5, params=params["V"]))`, or of a ratio of two parameters.
+
+        It is infinite where the function depends on what the data do not see.
+        """
+
+        def numbers(u) -> PyTree:
+            return function(self.parameters.restore_records(self.parameters.numbers(u, jnp)))
+
+        return jax.tree.map(
+            lambda slopes: deviations(np.asarray(slopes), self.information), jax.jacobian(numbers)(self.u)
+        )
 
     @with_doubles
     def profile(self, name: str, level: float = LEVEL) -> Profile:
