@@ -88,7 +88,11 @@ def look_up(op: str, attribute: Any, columns: Sequence, x) -> np.ndarray:
     if table.numbers is not None:
         entries = table.entries
     else:
-        entries = np.stack(np.broadcast_arrays(*[columns[i] for i in table.positions]))
+        given = [columns[i] for i in table.positions]
+        try:
+            entries = np.array(given)
+        except ValueError:  # numbers and arrays
+            entries = np.stack(np.broadcast_arrays(*given))
     if op == "take":
         index = np.clip(np.where(np.isnan(x), 0, x), 0, table.count - 1).astype(int)
         return entries[index] if entries.ndim == 1 else entries[(index, np.arange(entries.shape[1]))]

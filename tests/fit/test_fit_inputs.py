@@ -6,7 +6,8 @@ import diffrax
 import numpy as np
 import pytest
 from lagrangians import spring
-from scipy.signal import lsim
+from scipy.linalg import expm
+from scipy.signal import lfilter, lsim
 
 import lagjax
 from lagjax._fit import Parameters, Point
@@ -316,3 +317,22 @@ def test_what_is_wrong_with_inputs_is_a_sentence():
         TypeError, match=r"driven asks for `inputs`, and there are none: the records of lagjax.fit have"
     ):
         lagjax.simulate(SCENE, 0.0, 0.0, np.array([0.0, 1.0]), TRUTH)
+
+
+@pytest.mark.slow
+def test_a_record_of_more_samples_than_a_budget_of_steps_is_followed():
+    """A step ends at every sample of held inputs. By the exact map of an oscillator from one sample to the next."""
+    count, dt = 70_000, 0.5
+    driven = lagjax.System(
+        lambda q, v: 0.5 * v**2 - 0.5 * q**2, forces=lambda q, v, params, inputs: inputs - params["c"] * v
+    )
+    inputs = np.random.default_rng(0).normal(size=count)
+    step = expm(dt * np.array([[0.0, 1.0, 0.0], [-1.0, -0.1, 1.0], [0.0, 0.0, 0.0]]))
+    # q of x ← A x + b u by its characteristic polynomial, from rest.
+    a, b = step[:2, :2], step[:2, 2]
+    below = [1.0, -np.trace(a), np.linalg.det(a)]
+    exact = lfilter([0.0, b[0], a[0, 1] * b[1] - a[1, 1] * b[0]], below, inputs)
+    record = lagjax.Record(dt * np.arange(count), exact, inputs=inputs, start=(0.0, 0.0))
+    fit = lagjax.fit(driven, record, {"c": 0.1}, free=False)
+    assert np.abs(fit.residuals[0]).max() < 1e-6 * np.abs(exact).max()
+    assert np.abs(fit.predict(record).residuals).max() < 1e-6 * np.abs(exact).max()

@@ -24,7 +24,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine import Problem, Solution, choose
-from lagjax._engine.taylor import Flow, MachineCode, Motions, flow_of, jvp, project_start_tangents, tolerances_of
+from lagjax._engine.taylor import (
+    Flow,
+    MachineCode,
+    Motions,
+    Tolerances,
+    flow_of,
+    jvp,
+    project_start_tangents,
+    tolerances_of,
+)
 from lagjax._equations import has_constraints
 from lagjax._fit.model._inputs import InputForm, SampleTable, constant_tables, input_functions
 from lagjax._fit.model._parameters import Parameters
@@ -84,6 +93,11 @@ class AbstractMotions(abc.ABC):
         """q̈ (M, n) at M states `y` (M, 2n) and times `t` (M,), with parameters (M, P) and a table of inputs each."""
 
 
+def step_budget(samples: int) -> int:
+    """The budget of steps of a motion with this number of samples of inputs, at each of which a step ends."""
+    return 65_536 + 8 * samples
+
+
 def choose_motions(
     system: Scene, layout: Layout, parameters: Parameters, rtol: float, form: InputForm | None
 ) -> AbstractMotions:
@@ -94,7 +108,8 @@ def choose_motions(
 
     def problem(room: int) -> Problem:
         params = parameters.restore(parameters.example)
-        return Problem.from_system(scene, layout, params if form is None else form.params(params, room), rtol=rtol)
+        params = params if form is None else form.params(params, room)
+        return Problem.from_system(scene, layout, params, rtol=rtol, max_steps=step_budget(room))
 
     if isinstance(choose(problem(2)).engine, MachineCode):
         return _MachineCodeMotions(problem, form is not None)
@@ -107,28 +122,30 @@ class _MachineCodeMotions(AbstractMotions):
 
     def __init__(self, problem: Callable[[int], Problem], is_driven: bool):
         """`problem(room)` is about the scene with tables of inputs of this many instants."""
-        self.problem, self.tolerances, self.is_driven = problem, tolerances_of(problem(2)), is_driven
+        self.problem, self.is_driven = problem, is_driven
         self.projection = None if is_driven else flow_of(problem(2)).projection
 
-    def _flow(self, numbers: np.ndarray, table: SampleTable | None) -> tuple[Flow, np.ndarray]:
+    def _flow(self, numbers: np.ndarray, table: SampleTable | None) -> tuple[Flow, np.ndarray, Tolerances]:
         """The flow of the scene with inputs of this room, made once for all that are equal, and its parameters."""
-        if table is None or not self.is_driven:
-            return flow_of(self.problem(2)), numbers
-        return flow_of(self.problem(table.room)), table.rows(numbers)
+        room = 2
+        if table is not None and self.is_driven:
+            room, numbers = table.room, table.rows(numbers)
+        problem = self.problem(room)
+        return flow_of(problem), numbers, tolerances_of(problem)
 
     def follow(self, ts, y0, numbers, y0_dot, numbers_dot, table=None, modes=None, known=None):
-        flow, params = self._flow(numbers, table)
-        run = known or flow.run(ts, y0, params, self.tolerances)
+        flow, params, tolerances = self._flow(numbers, table)
+        run = known or flow.run(ts, y0, params, tolerances)
         if not y0_dot.shape[1] or not np.isin(run.result, ENDED_WELL).all():  # a lost motion needs no tangents
             none = np.zeros((len(y0), 0, *run.path.shape[1:]))
             return RecordMotion(run.path, none, run.result, run.t_end, run.y_end, run)
         params_dot = np.zeros((*y0_dot.shape[:2], params.shape[1]))
         params_dot[..., : numbers.shape[-1]] = numbers_dot
-        tangents, _ = jvp(flow, Motions.from_solution(ts, y0, params, run), y0_dot, params_dot, self.tolerances)
+        tangents, _ = jvp(flow, Motions.from_solution(ts, y0, params, run), y0_dot, params_dot, tolerances)
         return RecordMotion(run.path, tangents, run.result, run.t_end, run.y_end, run)
 
     def rate(self, t, y, numbers, table=None):
-        flow, params = self._flow(numbers, table)
+        flow, params, _ = self._flow(numbers, table)
         return flow.general_program.evaluate_many([*y.T, t, *params.T])[: flow.size].T
 
 

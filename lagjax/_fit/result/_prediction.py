@@ -13,6 +13,7 @@ from jaxtyping import PyTree
 from scipy.special import ndtri, stdtrit
 
 from lagjax._equations import has_constraints
+from lagjax._fit.model._motions import step_budget
 from lagjax._fit.model._noise import KnownNoise, NoiseScale
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import (
@@ -113,7 +114,7 @@ def predict_record(fit, record: Record, system: str | None) -> Prediction:
     scene, params = part.scene, about.params
     if form is not None:
         scene, params = form.bind_samples(scene, params, record.sampled_at, record.input_samples)
-    trajectory = simulate(scene, q0, qdot0, ts, params)
+    trajectory = simulate(scene, q0, qdot0, ts, params, max_steps=step_budget(len(record.ts)))
     planned, slopes = _follow_record(about, part, record, state)
     weights = record.weight_matrix * effective_share(fit) / noise.sigma**2
     own, follows = about.covariance(np.sqrt(weights)[..., None] * slopes, 2 * n, is_fitted)
