@@ -29,13 +29,18 @@ class TruncatedSVD(NamedTuple):
         """An orthonormal basis (k, k − rank), as columns, of the null space of one matrix."""
         return self.right[:, int(self.rank) :]
 
-    def least_norm(self, b: np.ndarray) -> np.ndarray:
-        """The shortest x (…, k) that solves the regular part of A x = b, b (…, m)."""
+    @property
+    def whitened(self) -> np.ndarray:
+        """The right singular vectors over their values, zero beyond the rank (…, k, min(m, k)): A times these is
+        orthonormal."""
         count = self.values.shape[-1]
         kept = np.arange(count) < self.rank[..., None]
         inverse = np.where(kept, 1.0 / np.where(kept, self.values, 1.0), 0.0)
-        inner = np.einsum("...mi,...m->...i", self.left, b) * inverse
-        return np.einsum("...ki,...i->...k", self.right[..., :count], inner)
+        return self.right[..., :count] * inverse[..., None, :]
+
+    def least_norm(self, b: np.ndarray) -> np.ndarray:
+        """The shortest x (…, k) that solves the regular part of A x = b, b (…, m)."""
+        return np.einsum("...ki,...i->...k", self.whitened, np.einsum("...mi,...m->...i", self.left, b))
 
 
 def truncated_svd(matrices: np.ndarray, relative: np.ndarray | float = 0.0, absolute: float = 0.0) -> TruncatedSVD:

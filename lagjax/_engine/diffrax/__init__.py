@@ -312,7 +312,7 @@ def _flatten_event(problem: Problem, ts, y0, numbers) -> tuple[diffrax.Event, bo
     ways = [sign > 0 if sign else way for sign, way in zip(signs, event.ways, strict=True)]
     if len(conditions) == 1:
         tolerance = 4 * float(jnp.finfo(ts.dtype).eps)
-        finder = event.root_finder or _SignChange(rtol=tolerance, atol=tolerance)
+        finder = event.root_finder or _EventBisection(rtol=tolerance, atol=tolerance)
         return diffrax.Event(conditions[0], finder, ways[0]), None not in signs
     if event.root_finder is None:
         raise ValueError(
@@ -324,7 +324,7 @@ def _flatten_event(problem: Problem, ts, y0, numbers) -> tuple[diffrax.Event, bo
     return diffrax.Event(conditions, event.root_finder, ways), None not in signs
 
 
-class _SignChange(optx.Bisection):
+class _EventBisection(optx.Bisection):
     """Bisection that stops when the interval is as small as the dtype resolves, whatever the size of the function.
 
     The sign change that fired an event brackets its root, so that this always arrives. It also does where there is

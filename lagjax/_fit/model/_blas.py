@@ -7,11 +7,15 @@ wait long: 482 rows of 289 columns, which one thread factorises in 2 ms, take tw
 import contextlib
 import ctypes
 import functools
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
+# The number of threads is that of the whole process. What those that are inside found when they entered: the last of
+# all that leaves takes what the first one found, whatever the order in which they leave.
+_lock, _found = threading.Lock(), []
 _NAME = "scipy_openblas_{}_num_threads{}"
 
 
@@ -22,12 +26,16 @@ def one_blas_thread() -> Iterator[None]:
         yield
         return
     get, put = pair
-    before = get()
-    put(1)
+    with _lock:
+        _found.append(get())
+        put(1)
     try:
         yield
     finally:
-        put(before)
+        with _lock:
+            count = _found.pop()
+            if not _found:
+                put(count)
 
 
 @functools.cache

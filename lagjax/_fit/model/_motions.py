@@ -192,7 +192,14 @@ def _programs_once(scene: Scene, layout: Layout, tree, leaves: tuple, options: t
         y0, numbers = state
         q, qdot = map(layout.restore, halves(y0))
         trajectory = simulate(
-            begin_in(scene, mode), q, qdot, ts, scene_params(numbers, table), throw=False, **dict(options)
+            begin_in(scene, mode),
+            q,
+            qdot,
+            ts,
+            scene_params(numbers, table),
+            throw=False,
+            max_steps=step_budget(table.knots.size if is_driven else 0),
+            **dict(options),
         )
         rows = jax.vmap(lambda q, v: jnp.concatenate([layout.flatten(q), layout.flatten(v)]))
         end = jnp.concatenate([layout.flatten(trajectory.end.q), layout.flatten(trajectory.end.qdot)])

@@ -31,7 +31,7 @@ from scipy.special import log_ndtr
 from lagjax._engine import Solution
 from lagjax._fit.model._blas import one_blas_thread
 from lagjax._fit.model._inputs import constant_tables, input_functions, inputs_at
-from lagjax._fit.model._motions import AbstractMotions, Manifold, Origins, RecordMotion
+from lagjax._fit.model._motions import AbstractMotions, Manifold, Origins, RecordMotion, step_budget
 from lagjax._fit.model._noise import (
     AbstractNoise,
     NoiseScale,
@@ -280,9 +280,7 @@ class SystemResiduals:
             pieces = [piece._replace(mode=mode) for piece, mode in zip(self.pieces, modes, strict=True)]
             with contextlib.suppress(LostMotion):
                 left[k] = replace(self, pieces=pieces)._measure_left(trial, numbers)
-        if not isinstance(
-            self.scene, Hybrid
-        ):  # records begin at rest rather than with little hops; nodes may be anywhere
+        if not isinstance(self.scene, Hybrid):  # records begin at rest, not with little hops; nodes may be anywhere
             weight = [_PLAINLY / len(piece.places) * (piece.places[0] == 0) for piece in self.pieces]
             left *= np.exp(-np.arange(most)[:, None] * weight)
         return [of[min(k, len(of) - 1)] for of, k in zip(found, np.argmin(left, axis=0).tolist(), strict=True)]
@@ -311,15 +309,16 @@ class SystemResiduals:
 
     def _measure_left(self, trial: Trial, numbers) -> np.ndarray:
         """The sum of squares (N,) that the motion of each piece leaves, infinite for those that are lost."""
-        begun = self._begin_trial(trial._replace(starts=trial.starts.copy(), solutions=[]), numbers, None, iter(()))
-        left, sensed = np.full(len(self.pieces), np.inf), len(self.signals.names)
+        found: list[np.ndarray] = []
+        trial = trial._replace(starts=trial.starts.copy(), residuals=found, solutions=[])
+        begun, left = self._begin_trial(trial, numbers, None, iter(())), np.full(len(self.pieces), np.inf)
         for batch in (one for one in self.batches if self.pieces[one.rows[0]].record not in self.clocks):
             motion, numbers_dot = self._follow(batch, batch.ts, begun, must=False), self._directions(batch, begun)[1]
             shown, _ = self.signals.evaluate(motion, batch.ts, batch.inputs, begun.numbers[batch.rows], numbers_dot)
+            self._append_residuals(batch, trial, shown)
             columns = self.columns(self.pieces[batch.rows[0]].record)
-            weights, values = batch.weights[..., columns], batch.values[..., columns]
-            r = wrap_residuals(shown - values, self.frame.periods[columns]) / self.size[:sensed]
-            squares = np.sum(np.where(weights > 0, weights * r**2, 0.0), axis=(1, 2))
+            r = found[-1][..., columns] / self.size[: len(self.signals.names)]
+            squares = np.sum(batch.weights[..., columns] * r**2, axis=(1, 2))
             left[batch.rows] = np.where(np.isfinite(squares), squares, np.inf)
         return left
 
@@ -421,7 +420,8 @@ class SystemResiduals:
             q, qdot = map(layout.restore, halves(y0))
             params = self.restore(numbers)
             own = params if form is None else DrivenParams(params, table)
-            motion = simulate(begin_in(scene, mode), q, qdot, ts, own, rtol=self.rtol, throw=False)
+            limits = {"rtol": self.rtol, "max_steps": step_budget(0 if form is None else table.knots.size)}
+            motion = simulate(begin_in(scene, mode), q, qdot, ts, own, **limits, throw=False)
             rows = jax.vmap(lambda q, v: jnp.concatenate([layout.flatten(q), layout.flatten(v)]))(motion.q, motion.qdot)
             return jax.vmap(lambda y, t, i: signals.evaluate_state(y, t, numbers, i))(rows, ts, inputs)
 

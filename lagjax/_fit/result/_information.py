@@ -175,10 +175,8 @@ def _fitted_products(residuals: Residuals, triangles, weighted: list, rows_of: l
         values, vectors = np.linalg.eigh(np.pad(half, (0, 1))[columns[:, :, None], columns[:, None]])
         found = [own @ (vectors * np.sqrt(np.maximum(values, 0.0))[:, None])[:, None]]
         if states:
-            decided = truncated_svd(triangles[residuals.leads[batch.rows], :states, :states], _UNFELT)
-            kept = np.arange(states) < decided.rank[:, None]
-            inverse = np.where(kept, 1.0 / np.where(kept, decided.values, 1.0), 0.0)
-            found.append(raw[..., :states] @ (decided.right * inverse[:, None])[:, None])
+            of_starts = truncated_svd(triangles[residuals.leads[batch.rows], :states, :states], _UNFELT)
+            found.append(raw[..., :states] @ of_starts.whitened[:, None])
         for s in range(signals):
             counted = batch.weights[..., s] > 0
             for direction in np.moveaxis(np.concatenate(found, axis=-1)[:, :, s], -1, 0):
@@ -285,7 +283,7 @@ def covariance_of_one_start(rows: np.ndarray, states: int, known: Information) -
     rows (T, S, K + L) of samples that count for what they are worth."""
     flat = rows.reshape(-1, rows.shape[-1])
     decided = truncated_svd(flat[:, :states], _UNFELT)
-    half = decided.right[:, : int(decided.rank)] / decided.values[: int(decided.rank)]
+    half = decided.whitened
     return known.lost * half @ half.T, decided.least_norm(flat[:, states:].T).T
 
 

@@ -111,10 +111,11 @@ def predict_record(fit, record: Record, system: str | None) -> Prediction:
     state, about.u[moves] = trial.starts[0], trial.u
     start = layout.restore(state[:n]), layout.restore(state[n:])
     q0, qdot0, ts = jax.tree.map(lambda x: np.asarray(x, layout.dtype), (*start, record.ts))
-    scene, params = part.scene, about.params
+    scene, params, samples = part.scene, about.params, 0
     if form is not None:
+        samples = len(record.sampled_at)
         scene, params = form.bind_samples(scene, params, record.sampled_at, record.input_samples)
-    trajectory = simulate(scene, q0, qdot0, ts, params, max_steps=step_budget(len(record.ts)))
+    trajectory = simulate(scene, q0, qdot0, ts, params, max_steps=step_budget(samples))
     planned, slopes = _follow_record(about, part, record, state)
     weights = record.weight_matrix * effective_share(fit) / noise.sigma**2
     own, follows = about.covariance(np.sqrt(weights)[..., None] * slopes, 2 * n, is_fitted)

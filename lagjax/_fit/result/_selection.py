@@ -41,7 +41,7 @@ from lagjax._fit.result._comparison import choose_simplest, cross_validate
 from lagjax._fit.result._information import Information, information, parameter_rows
 from lagjax._fit.search._descent import Descent, column_norms, eliminate, minimise
 
-_ENOUGH, _TRIALS = 1e-3, 60  # of the fit that is taken, as of the search
+_ENOUGH, _TRIALS = 1e-3, 60  # of the fit that is taken
 _ENOUGH_OF_STEP, _TRIALS_OF_STEP = 1e-2, 20  # of the other fits, whose BIC is then known to 0.02
 _DECIDED = 6.0  # of BIC: odds of 20 to 1, as those of an interval of 95 %
 _CORRELATED = 0.5  # of neighbouring residuals: beyond, the scene lacks something, and records left out decide

@@ -35,7 +35,7 @@ _FIRST, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-14, 1e12
 _PATIENCE = 12  # trials that lowered the sum of squares by less than ends a search, while derivatives promised more
 _NEAR = 1e-3  # per sample: where it pays to look at how much the residuals are correlated
 # A second derivative is found at a part of a step, and taken if it adds no more than a part of its length.
-_NEARBY, _MOST_BEND = 0.1, 0.375
+_NEARBY, _MOST_ACCELERATION = 0.1, 0.375
 _TAKEN_BACK = 8  # trials of a search: of that many in turn the last step is 2⁻³⁶ as long as the first
 _FLAT = 1e-13  # relative: half the sum of squares is itself rounded to so much
 _STOPPED = (
@@ -116,9 +116,9 @@ class _Model:
         scale = column_norms(self.triangles, states, unknowns)
         return eliminate(self.triangles, states, scale, damping, pull, unknowns, limits)
 
-    def bend(self, step: DescentStep, damping: float) -> DescentStep | None:
-        """The step along a valley that bends: more by half of the second derivative of motions along it, from one more
-        trial near its beginning; None where that is no small correction.
+    def accelerate_step(self, step: DescentStep, damping: float) -> DescentStep | None:
+        """The step with its geodesic acceleration, which follows a valley that bends: half of the second derivative of
+        motions along the step, from one more trial near its beginning. None where that is no small correction.
 
         Source: Transtrum & Sethna, *Improvements to the Levenberg–Marquardt algorithm* (2012), arXiv:1201.5885.
         """
@@ -138,7 +138,7 @@ class _Model:
         pull, limits = (self.anchor.weight, np.zeros_like(at.u)), residuals.parameters.limits(at.u)
         more = eliminate(triangles, residuals.states, scale, damping, pull, unknowns, limits)
         sizes = [np.hypot(np.linalg.norm(of_u * x.u), np.linalg.norm(of_starts * x.starts)) for x in (step, more)]
-        if not sizes[1] < _MOST_BEND * sizes[0]:
+        if not sizes[1] < _MOST_ACCELERATION * sizes[0]:
             return None
         return DescentStep(step.u + more.u, step.starts + more.starts, step.gain)
 
@@ -253,7 +253,7 @@ def _find_better_trial(
                 elif fall > 0.0:
                     damping = max(_LEAST_DAMPING, damping * max(0.1, 1.0 - (2.0 * fall / step.gain - 1.0) ** 3))
                     return trial, damping, trials, blind
-            step = model.bend(step, damping) if straight and trials < limit else None
+            step = model.accelerate_step(step, damping) if straight and trials < limit else None
             if step is None:
                 break
         damping, growth = damping * growth, 2.0 * growth
