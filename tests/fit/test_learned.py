@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.interpolate
+from scenes import in_potential
 
 import lagjax
 from lagjax.learned import dissipation, inertia, potential
@@ -219,3 +220,14 @@ def test_other_units_change_no_digit(mass):
 def test_a_mistake_is_a_sentence(make, words):
     with pytest.raises((TypeError, ValueError), match=words):
         make()
+
+
+@pytest.mark.slow
+def test_a_curved_function_of_dense_knots_is_not_said_to_be_straight():
+    ts = np.linspace(0.0, 10.0, 501)
+    swing = lagjax.simulate(in_potential(lambda q: -9.81 * jnp.cos(q)), 1.0, 0.0, ts).q
+    V = potential((-1.5, 1.5), count=60)
+    scene = lagjax.System(lambda q, v, params: 0.5 * v**2 - V(q, params=params["V"]))
+    record = lagjax.Record(ts, swing + 0.002 * np.random.default_rng(1).normal(size=501))
+    fit = lagjax.fit(scene, record, {"V": V.params0})
+    assert fit.ok and "which was seen from -1.0" in fit.message and "straight" not in fit.message, fit.message

@@ -195,6 +195,9 @@ def _sentence(square: np.ndarray, covariance: np.ndarray, part: SmoothPart) -> s
     seen = 1 + np.flatnonzero(after < _SEEN * before)
     if (knots := part.transform.knots) is None:
         return f"{text}."
+    felt, is_dense = _find_felt(square, part), determined >= max(1.0, 2.0 * seen.size)
+    if is_dense and felt.size:  # together, where knots are too dense for each of them to be seen alone
+        seen = felt
     if seen.size:
         where = f"seen from {knots[seen[0]]:.3g} to {knots[seen[-1]]:.3g}"
         return f"{text}, which was {where}; beyond, its interval is its prior's."
@@ -202,7 +205,6 @@ def _sentence(square: np.ndarray, covariance: np.ndarray, part: SmoothPart) -> s
         return (
             f"{text}: no motion was measured between the ends of its range, only its slope beyond one of them is seen."
         )
-    felt = _find_felt(square, part)
     if not felt.size:
         return f"{text}."
     where = f"from {knots[felt[0]]:.3g} to {knots[felt[-1]]:.3g}"
